@@ -1,0 +1,26 @@
+"""GCR-PPO for Stable-Baselines3: PPO that keeps the terms of a reward apart.
+
+Read the method top to bottom: ``components`` (names and levels of the reward's terms), ``advantages`` (one advantage per
+term), ``gradients`` (one gradient per term and their Gramian), ``resolvers`` (who yields to whom), ``gcrppo`` (the loop).
+"""
+
+from sb3_gcr.buffers import VectorRolloutBuffer
+from sb3_gcr.components import RewardDecomposition, RewardSpec
+from sb3_gcr.evaluation import evaluate_components
+from sb3_gcr.gcrppo import GCRPPO
+from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_gcr.resolvers import RESOLVERS
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "GCRPPO",
+    "RESOLVERS",
+    "CnnPolicy",
+    "MlpPolicy",
+    "MultiInputPolicy",
+    "RewardDecomposition",
+    "RewardSpec",
+    "VectorRolloutBuffer",
+    "evaluate_components",
+]

@@ -1,0 +1,109 @@
+"""Rollout storage for K reward components: what SB3's rollout buffers do, with a last axis of size K."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, RolloutBufferSamples
+
+from sb3_gcr.advantages import component_gae
+
+
+class VectorRolloutBuffer(RolloutBuffer):
+    """Rollout buffer whose ``rewards``, ``values``, ``advantages`` and ``returns`` have shape (T, N, K).
+
+    :param args: the arguments of SB3's ``RolloutBuffer``
+    :param n_objectives: number K of reward components
+    :param kwargs: the keyword arguments of SB3's ``RolloutBuffer``
+    """
+
+    def __init__(self, *args: Any, n_objectives: int = 1, **kwargs: Any):
+        self.n_objectives = n_objectives
+        super().__init__(*args, **kwargs)
+
+    def reset(self) -> None:
+        """Empty the buffer."""
+        super().reset()
+        self._tensors: dict[str, Any] = {}
+        for name in ("rewards", "values", "advantages", "returns"):
+            setattr(self, name, np.zeros((self.buffer_size, self.n_envs, self.n_objectives), dtype=np.float32))
+
+    def add(  # type: ignore[override]
+        self,
+        obs: Any,
+        action: NDArray[Any],
+        reward: NDArray[Any],
+        episode_start: NDArray[Any],
+        value: th.Tensor,
+        log_prob: th.Tensor,
+    ) -> None:
+        """Add one step of all envs.
+
+        :param obs: observations, one per env
+        :param action: actions, one per env
+        :param reward: reward components, shape (N, K)
+        :param episode_start: shape (N,)
+        :param value: V(s_t), shape (N, K)
+        :param log_prob: log π(a_t|s_t), shape (N,)
+        """
+        # SB3 flattens values, and a single number broadcasts; the values themselves are stored below.
+        super().add(obs, action, reward, episode_start, value[:1, :1], log_prob)
+        self.values[self.pos - 1] = value.cpu().numpy()
+
+    def compute_returns_and_advantage(self, last_values: th.Tensor, dones: NDArray[Any]) -> None:
+        """Fill ``advantages`` by :func:`~sb3_gcr.advantages.component_gae` and ``returns`` = advantages + values.
+
+        :param last_values: V(s_T), shape (N, K)
+        :param dones: whether the last step ended an episode, shape (N,)
+        """
+        self.advantages = component_gae(
+            self.rewards, self.values, self.episode_starts, last_values.cpu().numpy(), dones, self.gamma, self.gae_lambda
+        )
+        self.returns = self.advantages + self.values
+
+    def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
+        """Yield the rollout in random minibatches; ``old_values``, ``advantages`` and ``returns`` have shape (B, K).
+
+        The arrays become tensors on the device once per rollout; changes made to them after the first call are not seen.
+
+        :param batch_size: size B of a minibatch; None is the whole rollout
+        """
+        if not self._tensors:
+            self._tensors = {
+                "observations": self._to_samples(self.observations),
+                "actions": self._to_samples(self.actions.astype(np.float32, copy=False)),
+                "old_values": self._to_samples(self.values),
+                "old_log_prob": self._to_samples(self.log_probs).flatten(),
+                "advantages": self._to_samples(self.advantages),
+                "returns": self._to_samples(self.returns),
+            }
+        n_samples = self.buffer_size * self.n_envs
+        # NumPy's global generator and one permutation a pass, as in SB3: the minibatches are PPO's.
+        indices = th.from_numpy(np.random.permutation(n_samples)).to(self.device)
+        for batch in indices.split(batch_size or n_samples):
+            yield self._get_samples(batch)
+
+    def _get_samples(self, batch_inds: Any, env: Any = None) -> Any:
+        return RolloutBufferSamples(**{name: tensor[batch_inds] for name, tensor in self._tensors.items()})
+
+    def _to_samples(self, array: Any) -> Any:
+        return self.to_torch(self.swap_and_flatten(array), copy=False)
+
+
+class VectorDictRolloutBuffer(VectorRolloutBuffer, DictRolloutBuffer):
+    """:class:`VectorRolloutBuffer` for dictionary observations."""
+
+    def _get_samples(self, batch_inds: Any, env: Any = None) -> Any:
+        samples = {name: tensor[batch_inds] for name, tensor in self._tensors.items() if name != "observations"}
+        observations = {key: tensor[batch_inds] for key, tensor in self._tensors["observations"].items()}
+        return DictRolloutBufferSamples(observations=observations, **samples)
+
+    def _to_samples(self, array: Any) -> Any:
+        if isinstance(array, dict):
+            return {key: super(VectorDictRolloutBuffer, self)._to_samples(value) for key, value in array.items()}
+        return super()._to_samples(array)

@@ -1,0 +1,127 @@
+"""The component losses, their cotangents, and the Gramian of their gradients.
+
+All K surrogates share one log π(a_b|s_b), so the gradient of component k is Σ_b c_b^(k) ∇_θ log π(a_b|s_b): its cotangent c^(k)
+is all that distinguishes it. The step of any weights w is one backward pass with the cotangent c w.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+
+
+def clipped_surrogates(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
+    """PPO's clipped surrogate loss of each component, to be minimised; one ratio ρ for all of them.
+
+    .. math:: L^{(k)} = -\\frac{1}{B} \\sum_b \\min(ρ_b Â_b^{(k)}, \\mathrm{clip}(ρ_b, 1-ε, 1+ε) Â_b^{(k)})
+
+    :param log_prob: log π(a_b|s_b) of the current policy, shape (B,)
+    :param old_log_prob: the same of the policy that collected the data, shape (B,)
+    :param advantages: Â, shape (B, K)
+    :param clip_range: ε
+    :return: losses, shape (K,)
+    """
+    unclipped, clipped = _surrogates(log_prob, old_log_prob, advantages, clip_range)
+    return -th.min(unclipped, clipped).mean(0)
+
+
+def surrogate_cotangents(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
+    """Derivative of :func:`clipped_surrogates` by log π: c_b^(k) = ∂L^(k)/∂log π_b = -ρ_b Â_b^(k) / B where not clipped, else 0.
+
+    :param log_prob: shape (B,)
+    :param old_log_prob: shape (B,)
+    :param advantages: Â, shape (B, K)
+    :param clip_range: ε
+    :return: c, shape (B, K)
+    """
+    unclipped, clipped = _surrogates(log_prob, old_log_prob, advantages, clip_range)
+    return th.where(unclipped <= clipped, unclipped, 0.0) / -len(advantages)
+
+
+def _surrogates(
+    log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float
+) -> tuple[th.Tensor, th.Tensor]:
+    ratio = th.exp(log_prob - old_log_prob).unsqueeze(1)
+    return ratio * advantages, ratio.clamp(1 - clip_range, 1 + clip_range) * advantages
+
+
+def value_errors(
+    values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range_vf: float | None
+) -> tuple[th.Tensor, th.Tensor]:
+    """Mean squared error of each value head and its derivative by the values; the change of a head is clipped as in SB3's PPO.
+
+    .. math:: L_V^{(k)} = \\frac{1}{B} \\sum_b (V_b^{(k)} - Ĝ_b^{(k)})^2
+
+    with V replaced by V_old + clip(V - V_old, -c, c) if a ``clip_range_vf`` c is given.
+
+    :param values: V, shape (B, K)
+    :param old_values: V when the data were collected, shape (B, K)
+    :param returns: Ĝ, shape (B, K)
+    :param clip_range_vf: c in units of the return, or None
+    :return: losses, shape (K,), and cotangents ∂L_V^(k)/∂V_b^(k), shape (B, K)
+    """
+    if clip_range_vf is None:
+        error = values - returns
+        return (error**2).mean(0), error * (2 / len(values))
+    change = values - old_values
+    error = old_values + change.clamp(-clip_range_vf, clip_range_vf) - returns
+    free = change.abs() <= clip_range_vf
+    return (error**2).mean(0), th.where(free, error, 0.0) * (2 / len(values))
+
+
+def gramian_by_passes(log_prob: th.Tensor, cotangents: th.Tensor, parameters: Sequence[th.nn.Parameter]) -> th.Tensor:
+    """Gramian of the component gradients by K backward passes: works for every network.
+
+    G = J Jᵀ with rows g^(k) = Σ_b c_b^(k) ∇_θ log π_b, over the parameters that log π depends on. The graph is kept.
+
+    :param log_prob: with its graph, shape (B,)
+    :param cotangents: c, shape (B, K)
+    :param parameters: candidates; those that log π does not depend on contribute nothing
+    :return: G, shape (K, K)
+    """
+    rows = []
+    for cotangent in cotangents.unbind(1):
+        gradients = th.autograd.grad(log_prob, parameters, cotangent, retain_graph=True, allow_unused=True)
+        rows.append(th.cat([gradient.flatten() for gradient in gradients if gradient is not None]))
+    jacobian = th.stack(rows)
+    return jacobian @ jacobian.T
+
+
+class Evaluation:
+    """One forward pass of an actor-critic on a minibatch, and the backward passes through its graph: any network.
+
+    :param policy: has SB3's ``evaluate_actions``
+    :param observations: B observations
+    :param actions: B actions
+    """
+
+    def __init__(self, policy: Any, observations: Any, actions: th.Tensor):
+        self.values, self.log_prob, self.entropy = policy.evaluate_actions(observations, actions)
+        self._parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+
+    def gramian(self, cotangents: th.Tensor) -> th.Tensor:
+        """Gramian of the component gradients for cotangents of log π of shape (B, K); shape (K, K)."""
+        return gramian_by_passes(self.log_prob, cotangents, self._parameters)
+
+    def entropy_loss(self) -> th.Tensor:
+        """PPO's entropy loss: minus the mean entropy, or the mean log π where the entropy has no closed form."""
+        return self.log_prob.mean() if self.entropy is None else -self.entropy.mean()
+
+    def backward(self, cotangent: th.Tensor, value_cotangents: th.Tensor, ent_coef: float) -> None:
+        """Add the gradient of the whole loss to the parameters' ``grad``.
+
+        :param cotangent: of log π, shape (B,)
+        :param value_cotangents: of the values, shape (B, K)
+        :param ent_coef: weight of the entropy loss
+        """
+        outputs, cotangents = [self.log_prob, self.values], [cotangent, value_cotangents]
+        if ent_coef != 0:
+            outputs.append(self.entropy_loss())
+            cotangents.append(th.full_like(outputs[-1], ent_coef))
+        differentiable = [output.requires_grad for output in outputs]
+        th.autograd.backward(
+            [output for output, take in zip(outputs, differentiable, strict=True) if take],
+            [gradient for gradient, take in zip(cotangents, differentiable, strict=True) if take],
+        )

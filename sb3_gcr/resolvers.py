@@ -1,0 +1,242 @@
+"""Who yields to whom: from the Gramian of the component gradients to one weight per component.
+
+Every resolver is ``(gramian, levels, rng) -> weights``. With J = [g^(1) ... g^(K)]ᵀ and G = J Jᵀ the step is Jᵀ w, and
+everything a resolver needs is in G: a projected gradient is g_i' = W[i] J, so ⟨g_i', g_j⟩ = (W G)[i, j] and w = Σ_i W[i].
+Level 0 has the highest priority. Nothing here has the size of the network.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+Array = NDArray[np.float64]
+Levels = NDArray[np.integer[Any]]
+Resolver = Callable[[Array, Levels, np.random.Generator], Array]
+
+#: Two gradients conflict when ⟨g_i, g_j⟩ is below minus this share of |g_i| |g_j|: rounding is no conflict.
+TOLERANCE = 1e-12
+#: A component whose squared gradient norm is below this share of the largest one has no gradient.
+ZERO_ROW = 1e-40
+#: Ridge of the non-negative least squares on unit gradients: picks the minimal-norm weights when G is singular.
+RIDGE = 1e-12
+
+
+def conflicts(gramian: Array) -> NDArray[np.bool_]:
+    """Which pairs conflict: G_ij < 0 beyond rounding.
+
+    :param gramian: G, shape (K, K)
+    :return: shape (K, K), symmetric, False on the diagonal
+    """
+    norms = np.sqrt(np.diag(gramian))
+    return np.asarray(gramian < -TOLERANCE * np.outer(norms, norms))
+
+
+def cosines(gramian: Array) -> Array:
+    """Cosine between each two component gradients: G_ij / (|g_i| |g_j|), and 0 where one of them vanishes.
+
+    :param gramian: G, shape (K, K)
+    :return: shape (K, K)
+    """
+    norms = np.sqrt(np.diag(gramian))
+    scale = np.outer(norms, norms)
+    return np.divide(gramian, scale, out=np.zeros_like(gramian), where=scale > 0)
+
+
+def visiting_order(levels: Levels, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Order in which each component meets the others: from the lowest priority up, level 0 last, random inside a level.
+
+    :param levels: shape (K,)
+    :param rng: source of the order inside a level
+    :return: row i lists whom component i meets, shape (K, K)
+    """
+    n = len(levels)
+    return np.argsort(rng.random((n, n)) - levels, axis=1)
+
+
+def gcr(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
+    """The paper's rule: each g_i is projected off every conflicting g_j of its own or a higher level.
+
+    g_i' ← g_i' - min(0, ⟨g_i', g_j⟩) / G_jj · g_j, with the original g_j as in PCGrad (arXiv:2001.06782, algorithm 1): first
+    inside the own level, then the higher levels from the lowest up, so that level 0 has the last word. With one task,
+    no other component weakens it: (G w)_task ≥ G_task,task. With more tasks that conflict nothing is guaranteed.
+
+    :param gramian: G, shape (K, K)
+    :param levels: priority level of each component, 0 the highest, shape (K,)
+    :param rng: draws the order inside a level
+    :return: weights w ≥ 1, shape (K,)
+    """
+    weights = np.ones(len(gramian))
+    squared_norms = np.diag(gramian)
+    yields = (levels[:, None] >= levels) & ~np.eye(len(levels), dtype=bool)
+    yields &= squared_norms > ZERO_ROW * squared_norms.max(initial=0.0)
+    clash = -TOLERANCE * np.sqrt(np.outer(squared_norms, squared_norms))
+    rows = np.flatnonzero((yields & (gramian < clash)).any(1))
+    if rows.size == 0:
+        return weights
+    inner = gramian[rows]  # ⟨g_i', g_j⟩
+    each = np.arange(rows.size)
+    for met in visiting_order(levels, rng)[rows].T:
+        projects = yields[rows, met] & (inner[each, met] < clash[rows, met])
+        step = np.where(projects, -inner[each, met], 0.0) / np.where(projects, squared_norms[met], 1.0)
+        inner += step[:, None] * gramian[met]
+        np.add.at(weights, met, step)
+    return weights
+
+
+def no_priority(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
+    """PCGrad over all components, whatever their level (the paper's NoPriority).
+
+    :param gramian: G, shape (K, K)
+    :param levels: ignored
+    :param rng: draws the order
+    :return: weights w ≥ 1, shape (K,)
+    """
+    return gcr(gramian, np.zeros_like(levels), rng)
+
+
+def gcr_authors(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
+    """The authors' released rule: in place, tasks against tasks and every other component against tasks only.
+
+    g_i' is projected off the g_j' that the pass has left so far, in one random order over i and one over j for each i.
+    Components of level 1 and below are not projected off each other. Their absolute 1e-8 is left out.
+
+    :param gramian: G, shape (K, K)
+    :param levels: 0 is a task, everything else a regulariser, shape (K,)
+    :param rng: draws the orders
+    :return: weights, shape (K,)
+    """
+    n = len(gramian)
+    projected = np.eye(n)  # W
+    floor = ZERO_ROW * np.diag(gramian).max(initial=0.0)
+    for i in rng.permutation(n):
+        for j in rng.permutation(n):
+            if i == j or levels[j] > 0:
+                continue
+            inner = projected[i] @ gramian @ projected[j]
+            squared_norm = projected[j] @ gramian @ projected[j]
+            if squared_norm > floor and inner < -TOLERANCE * np.sqrt(gramian[i, i] * squared_norm):
+                projected[i] -= inner / squared_norm * projected[j]
+    return np.asarray(projected.sum(0))
+
+
+def plain_sum(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
+    """No surgery: w = 1 (the paper's Multi-head PPO).
+
+    :param gramian: G, shape (K, K); only its size is used
+    :param levels: ignored
+    :param rng: ignored
+    :return: ones, shape (K,)
+    """
+    return np.ones(len(gramian))
+
+
+def guaranteed(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
+    """Level by level, so that no level ever harms a component of a higher one, for any number of tasks.
+
+    Inside a level UPGrad (arXiv:2406.16232) with sum preference: each g_i is projected onto the level's dual cone
+    {d : ⟨g_j, d⟩ ≥ 0 for all j of the level} and the projections are added. The level's sum is then projected onto the dual
+    cone of all components of higher levels. Members of a lower level may end worse: that is what priority means.
+
+    :param gramian: G, shape (K, K)
+    :param levels: priority level of each component, 0 the highest, shape (K,)
+    :param rng: ignored, the result is deterministic
+    :return: weights, shape (K,)
+    """
+    weights = np.ones(len(gramian))
+    squared_norms = np.diag(gramian)
+    if not conflicts(gramian).any():
+        return weights
+    alive = np.flatnonzero(squared_norms > ZERO_ROW * squared_norms.max())
+    norms = np.sqrt(squared_norms[alive])
+    unit_gradients = _columns(gramian[np.ix_(alive, alive)] / np.outer(norms, norms))
+    projected = np.diag(norms)  # W in units of unit gradients: row i is g_i' as it is built up
+    for level in np.unique(levels[alive]):
+        own, higher = levels[alive] == level, levels[alive] < level
+        for i in np.flatnonzero(own):
+            projected[i] += _dual_cone_step(unit_gradients, projected[i], own)
+        first = np.flatnonzero(own)[0]
+        projected[first] += _dual_cone_step(unit_gradients, projected[own].sum(0), higher)
+    weights[alive] = projected.sum(0) / norms
+    return weights
+
+
+def _columns(gramian: Array) -> Array:
+    """A matrix A with AᵀA = G: its columns are the gradients, written in K coordinates."""
+    eigenvalues, eigenvectors = np.linalg.eigh(gramian)
+    return np.asarray(np.sqrt(eigenvalues.clip(min=0.0))[:, None] * eigenvectors.T)
+
+
+def _dual_cone_step(columns: Array, coefficients: Array, members: NDArray[np.bool_]) -> Array:
+    """What to add to ``coefficients`` so that d = columns @ coefficients lands on the nearest point of the members' dual cone.
+
+    min_λ |d + A_members λ|² subject to λ ≥ 0; its optimality conditions are ⟨g_j, d + A λ⟩ ≥ 0 with equality where λ_j > 0.
+    """
+    step = np.zeros_like(coefficients)
+    size = np.linalg.norm(coefficients)
+    if members.any() and size > 0:
+        ridge = np.sqrt(RIDGE) * np.eye(int(members.sum()))
+        target = -(columns @ coefficients) / size
+        step[members] = size * nnls(np.vstack([columns[:, members], ridge]), np.append(target, np.zeros(len(ridge))))[0]
+    return step
+
+
+def from_torchjd(weighting: Any) -> Resolver:
+    """Use a TorchJD weighting of Gramians as a resolver; levels are ignored.
+
+    TorchJD's absolute ``norm_eps`` and ``reg_eps`` would switch it off for small gradients, so G is divided by its largest
+    diagonal entry. For UPGrad and DualProj it is preconditioned instead: D^(-1/2) G D^(-1/2) with the preference u_i √G_ii,
+    and the weights scaled back. Components without gradient are left out and get weight 1. Weightings that draw random
+    numbers draw them from torch's global generator.
+
+    :param weighting: e.g. ``torchjd.aggregation.UPGradWeighting()``; must accept a (K, K) tensor and return (K,) weights
+    :return: a resolver for ``GCRPPO(resolver=...)``
+    :raises ImportError: if TorchJD is missing
+    :raises TypeError: if ``weighting`` is no TorchJD weighting
+    """
+    try:
+        import torch as th
+        from torchjd.aggregation import DualProjWeighting, UPGradWeighting, Weighting
+    except ImportError as error:
+        raise ImportError("`from_torchjd` needs TorchJD: pip install 'sb3_gcr[torchjd]'") from error
+    if not isinstance(weighting, Weighting):
+        raise TypeError(
+            f"Parameter `weighting` must be a torchjd.aggregation.*Weighting, found {type(weighting).__name__}. "
+            "Aggregators such as UPGrad() carry theirs as `.gramian_weighting`."
+        )
+    preference = getattr(weighting, "pref_vector", None)
+    preconditioned = copy.deepcopy(weighting) if isinstance(weighting, UPGradWeighting | DualProjWeighting) else None
+
+    def resolve(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
+        weights = np.ones(len(gramian))
+        squared_norms = np.diag(gramian)
+        alive = np.flatnonzero(squared_norms > ZERO_ROW * squared_norms.max(initial=0.0))
+        if alive.size == 0:
+            return weights
+        if preconditioned is None:
+            scaled = gramian[np.ix_(alive, alive)] / squared_norms.max()
+            weights[alive] = weighting(th.from_numpy(scaled)).numpy()
+            return weights
+        norms = np.sqrt(squared_norms[alive])
+        wanted = np.full(len(gramian), 1 / len(gramian)) if preference is None else preference.double().numpy()
+        preconditioned.pref_vector = th.from_numpy(wanted[alive] * norms / norms.max())
+        scaled = gramian[np.ix_(alive, alive)] / np.outer(norms, norms)
+        weights[alive] = preconditioned(th.from_numpy(scaled)).numpy() / norms * norms.max()
+        return weights
+
+    return resolve
+
+
+#: Resolvers by the name that ``GCRPPO(resolver=...)`` takes.
+RESOLVERS: dict[str, Resolver] = {
+    "gcr": gcr,
+    "gcr_authors": gcr_authors,
+    "no_priority": no_priority,
+    "sum": plain_sum,
+    "guaranteed": guaranteed,
+}
