@@ -244,7 +244,7 @@ def find_fault(components: NDArray[Any], rewards: NDArray[Any], spec: RewardSpec
     :param components: shape (N, K)
     :param rewards: shape (N,)
     :param spec: names the K components
-    :param tolerance: allowed \\|Σ_k r^(k) - r\\| relative to Σ_k \\|r^(k)\\|
+    :param tolerance: allowed abs(Σ_k r^(k) - r) relative to Σ_k abs(r^(k)) + abs(r)
     :return: index of the env and what is wrong, or None
     """
     with np.errstate(invalid="ignore"):

@@ -42,7 +42,7 @@ def summarise(minibatches: Sequence[MinibatchStatistics], spec: RewardSpec) -> t
     :return: PPO's keys and ours without a component (``approx_kl`` over the last epoch, as in PPO), and those per component
     """
     gramians = np.array([minibatch.gramian for minibatch in minibatches])
-    clash = np.array([conflicts(gramian) for gramian in gramians])
+    clash = conflicts(gramians)
     weights = np.array([minibatch.weights for minibatch in minibatches])
     value_losses = np.mean([minibatch.value_losses for minibatch in minibatches], axis=0)
     n_conflicts = clash.sum((1, 2)).mean() / 2
@@ -58,7 +58,7 @@ def summarise(minibatches: Sequence[MinibatchStatistics], spec: RewardSpec) -> t
         "gcr/conflict_rate": n_conflicts / n_pairs,
         "gcr/kappa": np.mean([minibatch.kappa for minibatch in minibatches]),
     }
-    norms = np.sqrt(np.einsum("bkk->bk", gramians)).mean(0)
+    norms = np.sqrt(np.diagonal(gramians, axis1=1, axis2=2)).mean(0)
     by_component = {
         "gcr/weight": weights.mean(0),
         "gcr/grad_norm": norms,
@@ -75,7 +75,7 @@ def summarise(minibatches: Sequence[MinibatchStatistics], spec: RewardSpec) -> t
 
 def mean_cosines(minibatches: Sequence[MinibatchStatistics]) -> NDArray[np.float64]:
     """Cosine matrix of the component gradients, mean over the minibatches of an update, shape (K, K)."""
-    return np.asarray(np.mean([cosines(minibatch.gramian) for minibatch in minibatches], axis=0))
+    return np.asarray(cosines(np.array([minibatch.gramian for minibatch in minibatches])).mean(0))
 
 
 def component_table(spec: RewardSpec, values: Mapping[str, Any]) -> str:

@@ -42,7 +42,8 @@ from sb3_gcr.diagnostics import (
     mean_cosines,
     summarise,
 )
-from sb3_gcr.gradients import Evaluation, clipped_surrogates, surrogate_cotangents, value_errors
+from sb3_gcr.gradients import ManyBackwards, clipped_surrogates, surrogate_cotangents, value_errors
+from sb3_gcr.one_backward import OneBackward
 from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiHeadActorCriticPolicy, MultiInputPolicy
 from sb3_gcr.resolvers import RESOLVERS, Resolver
 from sb3_gcr.schedules import adapt_learning_rate
@@ -66,6 +67,10 @@ class GCRPPO(PPO):
         than one component and "minibatch", as in PPO, for one
     :param kappa_max: bound of κ · max_k std(A^(k)), for components that cancel each other
     :param desired_kl: target of the learning rate that follows the KL divergence; None keeps ``learning_rate``
+    :param gramian_method: "one_backward" for actors of linear layers, "passes" (K backward passes) for any network; "auto" takes
+        the first where it fits. Both give the same numbers
+    :param gramian_samples: number of samples of each minibatch that the weights are taken from, for large networks and
+        batches; the step takes all of them. None is exact
     :raises ValueError: for an unknown resolver or scope, a wrong policy class, a spec that does not match a loaded model
     """
 
@@ -108,12 +113,16 @@ class GCRPPO(PPO):
         advantage_scope: str | None = None,
         kappa_max: float = 10.0,
         desired_kl: float | None = None,
+        gramian_method: str = "auto",
+        gramian_samples: int | None = None,
     ):
         self.resolver = resolver
         self.resolver_kwargs = resolver_kwargs
         self.advantage_scope = advantage_scope
         self.kappa_max = kappa_max
         self.desired_kl = desired_kl
+        self.gramian_method = gramian_method
+        self.gramian_samples = gramian_samples
         self.reward_spec: RewardSpec | None = None
         self.ep_component_buffer: deque[NDArray[np.float64]] = deque(maxlen=stats_window_size)
         self._episode_components: NDArray[np.float64] | None = None
@@ -164,7 +173,6 @@ class GCRPPO(PPO):
         elif self.reward_spec is None:
             self.reward_spec = SCALAR_REWARD
         self._resolve = _bind_resolver(self.resolver, self.resolver_kwargs)
-        self._evaluate = Evaluation
         loaded_rng = self._resolver_rng
         given = {name: getattr(self, name) for name in ("policy_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs")}
         if not self._is_plain_ppo:
@@ -184,6 +192,12 @@ class GCRPPO(PPO):
             )
         if not self.kappa_max > 0:
             raise ValueError(f"Parameter `kappa_max` must be a number > 0, found {self.kappa_max!r}.")
+        if self.gramian_method not in ("auto", "one_backward", "passes"):
+            raise ValueError(
+                f"Parameter `gramian_method` must be 'auto', 'one_backward' or 'passes', found {self.gramian_method!r}."
+            )
+        if self.gramian_samples is not None and not self.gramian_samples > 0:
+            raise ValueError(f"Parameter `gramian_samples` must be an integer > 0 or None, found {self.gramian_samples!r}.")
         if self.desired_kl is not None and not self.desired_kl > 0:
             raise ValueError(f"Parameter `desired_kl` must be a number > 0 or None, found {self.desired_kl!r}.")
         if any(base.__module__.startswith("sb3_contrib") for base in self.policy_class.__mro__):
@@ -256,7 +270,7 @@ class GCRPPO(PPO):
         self.reward_spec = spec
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_resolve", "_reader", "_evaluate"]
+        return [*super()._excluded_save_params(), "_resolve", "_reader", "_networks"]
 
     # --------------------------------------------------------------- rollouts
 
@@ -390,6 +404,7 @@ class GCRPPO(PPO):
         clip_range_vf = None
         if self.clip_range_vf is not None:
             clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
+        self._networks = self._choose_networks()
         kappa = self._normalize_rollout()
         minibatches: list[MinibatchStatistics] = []
         continue_training = True
@@ -403,6 +418,17 @@ class GCRPPO(PPO):
             if not continue_training:
                 break
         self._log_update(minibatches, clip_range, clip_range_vf)
+
+    def _choose_networks(self) -> OneBackward | ManyBackwards:
+        """The cheapest way through the policy that gives the exact Gramian."""
+        fits = OneBackward.fits(self.policy)
+        if self.gramian_method == "one_backward" and not fits:
+            raise ValueError(
+                "Parameter `gramian_method` must be 'auto' or 'passes' for this policy, found 'one_backward', which needs an "
+                "actor and a critic of linear layers and common activations, a flat features extractor and no gSDE."
+            )
+        self.logger.record("gcr/one_backward", int(fits and self.gramian_method != "passes"))
+        return ManyBackwards(self.policy) if self.gramian_method == "passes" or not fits else OneBackward(self.policy)
 
     def _check_rollout_is_finite(self) -> None:
         """Refuse a rollout with NaN or infinity, which rewards, observations or the networks may have brought in."""
@@ -432,20 +458,20 @@ class GCRPPO(PPO):
     ) -> tuple[MinibatchStatistics, bool]:
         """One optimiser step; returns the minibatch's figures and whether ``target_kl`` lets training go on."""
         actions = batch.actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else batch.actions
-        evaluation = self._evaluate(self.policy, batch.observations, actions)
+        networks = self._networks.evaluate(batch.observations, actions)
         with th.no_grad():
             advantages, kappa = batch.advantages, th.ones(())
             if self._scope == "minibatch":
                 kappa = th.as_tensor(joint_scale(advantages, kappa_max=self.kappa_max))
                 advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
-            surrogate = (evaluation.log_prob, batch.old_log_prob, advantages, clip_range)
+            surrogate = (networks.log_prob, batch.old_log_prob, advantages, clip_range)
             cotangents = surrogate_cotangents(*surrogate)
-            value_losses, value_cotangents = value_errors(evaluation.values, batch.old_values, batch.returns, clip_range_vf)
+            value_losses, value_cotangents = value_errors(networks.values, batch.old_values, batch.returns, clip_range_vf)
             losses = th.cat([clipped_surrogates(*surrogate), value_losses])
-        gramian = evaluation.gramian(cotangents)
+        gramian = networks.gramian(cotangents, self.gramian_samples)
         with th.no_grad():
-            kl, clip_fraction = _kl_and_clip_fraction(evaluation.log_prob, batch.old_log_prob, clip_range)
-            scalars = th.stack([evaluation.entropy_loss(), clip_fraction, kl, kappa.to(kl.device)])
+            kl, clip_fraction = _kl_and_clip_fraction(networks.log_prob, batch.old_log_prob, clip_range)
+            scalars = th.stack([networks.entropy_loss(), clip_fraction, kl, kappa.to(kl.device)])
             host = th.cat([gramian.flatten(), losses, scalars]).cpu().double().numpy()
         statistics = self._resolve_minibatch(host)
         if self.target_kl is not None and statistics.approx_kl > 1.5 * self.target_kl:
@@ -453,10 +479,9 @@ class GCRPPO(PPO):
             return statistics, False
         if self.desired_kl is not None and not is_first:  # before the first step the KL divergence is 0 and says nothing
             self._set_learning_rate(adapt_learning_rate(self._learning_rate, statistics.approx_kl, self.desired_kl))
-        self.policy.optimizer.zero_grad()
         weights = th.as_tensor(statistics.weights, dtype=cotangents.dtype, device=cotangents.device)
-        evaluation.backward(cotangents @ weights, self.vf_coef * value_cotangents, self.ent_coef)
-        norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm).item()
+        networks.backward(cotangents @ weights, self.vf_coef * value_cotangents, self.ent_coef)
+        norm = networks.clip_gradients(self.max_grad_norm).item()
         if not np.isfinite(norm):
             raise ValueError(self._not_finite_message("gradient norm", norm))
         self.policy.optimizer.step()
@@ -618,7 +643,7 @@ def _wrong_policy_message(name: str) -> str:
 
 
 def _kl_and_clip_fraction(log_prob: th.Tensor, old_log_prob: th.Tensor, clip_range: float) -> tuple[th.Tensor, th.Tensor]:
-    """KL(old ‖ current) by the estimator mean((ρ - 1) - log ρ), and the share of samples with \|ρ - 1\| > ε."""
+    """KL(old ‖ current) by the estimator mean((ρ - 1) - log ρ), and the share of samples with abs(ρ - 1) > ε."""
     log_ratio = log_prob - old_log_prob
     excess = th.exp(log_ratio) - 1
     return (excess - log_ratio).mean(), (excess.abs() > clip_range).float().mean()

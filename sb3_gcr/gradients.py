@@ -89,39 +89,54 @@ def gramian_by_passes(log_prob: th.Tensor, cotangents: th.Tensor, parameters: Se
     return jacobian @ jacobian.T
 
 
-class Evaluation:
-    """One forward pass of an actor-critic on a minibatch, and the backward passes through its graph: any network.
+class ManyBackwards:
+    """An actor-critic of any kind, evaluated with SB3's ``evaluate_actions`` and differentiated with K + 1 backward passes.
 
-    :param policy: has SB3's ``evaluate_actions``
-    :param observations: B observations
-    :param actions: B actions
+    Call :meth:`evaluate` with a minibatch, then :meth:`gramian` and :meth:`backward`.
+
+    :param policy: an SB3 ``ActorCriticPolicy``
     """
 
-    def __init__(self, policy: Any, observations: Any, actions: th.Tensor):
-        self.values, self.log_prob, self.entropy = policy.evaluate_actions(observations, actions)
+    def __init__(self, policy: Any):
+        self.policy = policy
         self._parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
 
-    def gramian(self, cotangents: th.Tensor) -> th.Tensor:
-        """Gramian of the component gradients for cotangents of log π of shape (B, K); shape (K, K)."""
+    def evaluate(self, observations: Any, actions: th.Tensor) -> ManyBackwards:
+        """Forward pass of actor and critic; sets ``values`` (B, K) and ``log_prob`` (B,)."""
+        self.values, self.log_prob, self._entropy = self.policy.evaluate_actions(observations, actions)
+        return self
+
+    def gramian(self, cotangents: th.Tensor, n_samples: int | None = None) -> th.Tensor:
+        """Gramian of the component gradients, shape (K, K).
+
+        :param cotangents: of log π, shape (B, K)
+        :param n_samples: take the first n rows of the minibatch instead of all; they are in random order already
+        """
+        if n_samples is not None:
+            cotangents = cotangents.clone()
+            cotangents[n_samples:] = 0
         return gramian_by_passes(self.log_prob, cotangents, self._parameters)
 
     def entropy_loss(self) -> th.Tensor:
         """PPO's entropy loss: minus the mean entropy, or the mean log π where the entropy has no closed form."""
-        return self.log_prob.mean() if self.entropy is None else -self.entropy.mean()
+        return self.log_prob.mean() if self._entropy is None else -self._entropy.mean()
 
     def backward(self, cotangent: th.Tensor, value_cotangents: th.Tensor, ent_coef: float) -> None:
-        """Add the gradient of the whole loss to the parameters' ``grad``.
+        """Set the gradient of the whole loss; frees the graph.
 
         :param cotangent: of log π, shape (B,)
         :param value_cotangents: of the values, shape (B, K)
         :param ent_coef: weight of the entropy loss
         """
+        for parameter in self._parameters:
+            parameter.grad = None
         outputs, cotangents = [self.log_prob, self.values], [cotangent, value_cotangents]
         if ent_coef != 0:
             outputs.append(self.entropy_loss())
             cotangents.append(th.full_like(outputs[-1], ent_coef))
-        differentiable = [output.requires_grad for output in outputs]
-        th.autograd.backward(
-            [output for output, take in zip(outputs, differentiable, strict=True) if take],
-            [gradient for gradient, take in zip(cotangents, differentiable, strict=True) if take],
-        )
+        pairs = [pair for pair in zip(outputs, cotangents, strict=True) if pair[0].requires_grad]
+        th.autograd.backward([output for output, _ in pairs], [gradient for _, gradient in pairs])
+
+    def clip_gradients(self, max_norm: float) -> th.Tensor:
+        """Scale all gradients down to a joint norm of at most ``max_norm``; the norm before."""
+        return th.nn.utils.clip_grad_norm_(self._parameters, max_norm)

@@ -23,29 +23,34 @@ Resolver = Callable[[Array, Levels, np.random.Generator], Array]
 TOLERANCE = 1e-12
 #: A component whose squared gradient norm is below this share of the largest one has no gradient.
 ZERO_ROW = 1e-40
+#: Eigenvalues of a Gramian of unit gradients below this share of the largest are rounding.
+ROUNDING = 1e-13
 #: Ridge of the non-negative least squares on unit gradients: picks the minimal-norm weights when G is singular.
-RIDGE = 1e-12
+RIDGE = 1e-10
 
 
 def conflicts(gramian: Array) -> NDArray[np.bool_]:
     """Which pairs conflict: G_ij < 0 beyond rounding.
 
-    :param gramian: G, shape (K, K)
-    :return: shape (K, K), symmetric, False on the diagonal
+    :param gramian: G, shape (..., K, K)
+    :return: shape (..., K, K), symmetric, False on the diagonal
     """
-    norms = np.sqrt(np.diag(gramian))
-    return np.asarray(gramian < -TOLERANCE * np.outer(norms, norms))
+    return np.asarray(gramian < -TOLERANCE * _products_of_norms(gramian))
 
 
 def cosines(gramian: Array) -> Array:
     """Cosine between each two component gradients: G_ij / (|g_i| |g_j|), and 0 where one of them vanishes.
 
-    :param gramian: G, shape (K, K)
-    :return: shape (K, K)
+    :param gramian: G, shape (..., K, K)
+    :return: shape (..., K, K)
     """
-    norms = np.sqrt(np.diag(gramian))
-    scale = np.outer(norms, norms)
+    scale = _products_of_norms(gramian)
     return np.divide(gramian, scale, out=np.zeros_like(gramian), where=scale > 0)
+
+
+def _products_of_norms(gramian: Array) -> Array:
+    norms = np.sqrt(np.diagonal(gramian, axis1=-2, axis2=-1))
+    return np.asarray(norms[..., :, None] * norms[..., None, :])
 
 
 def visiting_order(levels: Levels, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -169,7 +174,8 @@ def guaranteed(gramian: Array, levels: Levels, rng: np.random.Generator) -> Arra
 def _columns(gramian: Array) -> Array:
     """A matrix A with AᵀA = G: its columns are the gradients, written in K coordinates."""
     eigenvalues, eigenvectors = np.linalg.eigh(gramian)
-    return np.asarray(np.sqrt(eigenvalues.clip(min=0.0))[:, None] * eigenvectors.T)
+    eigenvalues[eigenvalues < ROUNDING * eigenvalues.max()] = 0.0
+    return np.asarray(np.sqrt(eigenvalues)[:, None] * eigenvectors.T)
 
 
 def _dual_cone_step(columns: Array, coefficients: Array, members: NDArray[np.bool_]) -> Array:

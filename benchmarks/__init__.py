@@ -1,0 +1,1 @@
+"""What GCRPPO costs, measured through the public API: ``python -m benchmarks --help``."""

@@ -1,0 +1,373 @@
+"""The exact Gramian of K component gradients from one backward pass, for actors made of linear layers.
+
+With c_b^(k) = ∂L^(k)/∂log π_b the gradient of component k is g^(k) = Σ_b c_b^(k) ∂log π_b/∂θ. Reverse mode is linear in the
+cotangent and samples do not mix, so one backward pass of Σ_b log π_b gives every layer's signal Δ = (δ_b) for all K. With the
+layer's input H = (h_b), and S = ∂log π_b/∂log σ row by row,
+
+    G_kl = c^(k)ᵀ M c^(l),    M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ + 1) + S Sᵀ,
+
+and the step of any weights w has the weight gradients (Δ ∘ c w)ᵀ H. Forward and backward are written out here, because for
+small networks most of the time of an update is PyTorch's bookkeeping, not arithmetic.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.distributions import (
+    BernoulliDistribution,
+    CategoricalDistribution,
+    DiagGaussianDistribution,
+    MultiCategoricalDistribution,
+)
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, MlpExtractor
+from torch import nn
+
+#: Numbers that a block of K weight gradients may hold at a time, on the CPU and on other devices.
+BLOCK, BLOCK_ON_DEVICE = 2**22, 2**26
+#: Minibatches up to this size get M in one piece, larger ones by rows of half of it.
+WHOLE = 512
+_aten = th.ops.aten
+_LOG_2PI = float(np.log(2 * np.pi))
+
+
+#: Activations that act on each number alone and draw nothing at random.
+ACTIVATIONS = (
+    nn.Tanh,
+    nn.ReLU,
+    nn.ELU,
+    nn.SELU,
+    nn.CELU,
+    nn.GELU,
+    nn.SiLU,
+    nn.Mish,
+    nn.Sigmoid,
+    nn.LogSigmoid,
+    nn.LeakyReLU,
+    nn.Softplus,
+    nn.Softsign,
+    nn.Hardtanh,
+    nn.ReLU6,
+    nn.Hardswish,
+    nn.Identity,
+)
+
+
+class Activation:
+    """An activation behind a linear layer, and its derivative: closed where that is cheap, PyTorch's elsewhere.
+
+    :param module: of a type in ``ACTIVATIONS``
+    """
+
+    def __init__(self, module: nn.Module):
+        self.module = module
+
+    def forward(self, preactivation: th.Tensor) -> th.Tensor:
+        """Output of shape (B, out)."""
+        if isinstance(self.module, nn.Tanh | nn.ReLU | nn.ELU):
+            self._output: th.Tensor = self.module(preactivation)
+            return self._output
+        with th.enable_grad():
+            self._input = preactivation.detach().requires_grad_()
+            self._output = self.module(self._input)
+        return self._output.detach()
+
+    def backward(self, signal: th.Tensor) -> th.Tensor:
+        """Signal in front of the activation from the one behind it."""
+        if isinstance(self.module, nn.Tanh):
+            return _aten.tanh_backward(signal, self._output)  # type: ignore[no-any-return]
+        if isinstance(self.module, nn.ReLU):
+            return _aten.threshold_backward(signal, self._output, 0)  # type: ignore[no-any-return]
+        if isinstance(self.module, nn.ELU):
+            return _aten.elu_backward(signal, self.module.alpha, 1, 1, True, self._output)  # type: ignore[no-any-return]
+        return th.autograd.grad(self._output, self._input, signal, retain_graph=True)[0]
+
+
+class Mlp:
+    """Linear layers with an activation behind each but the last, run forward and backward by hand.
+
+    :param modules: linear layers and activations in turn, beginning and ending with a linear layer
+    """
+
+    def __init__(self, *modules: nn.Module):
+        self.layers: list[Any] = list(modules[::2])
+        self.activations = [Activation(module) for module in modules[1::2]]
+
+    @staticmethod
+    def fits(*modules: nn.Module) -> bool:
+        """Whether the modules are linear layers and known activations in turn, without hooks."""
+        right_types = [
+            type(module) is nn.Linear and module.bias is not None
+            if index % 2 == 0 else type(module) in ACTIVATIONS
+            for index, module in enumerate(modules)
+        ]
+        hooked = any(module._forward_hooks or module._forward_pre_hooks or module._backward_hooks for module in modules)
+        in_place = any(getattr(module, "inplace", False) for module in modules)
+        return len(modules) % 2 == 1 and all(right_types) and not hooked and not in_place
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """Output for features of shape (B, in); each layer's input H is kept."""
+        self.inputs = [features]
+        for layer, activation in zip(self.layers, self.activations, strict=False):
+            self.inputs.append(activation.forward(nn.functional.linear(self.inputs[-1], layer.weight, layer.bias)))
+        return nn.functional.linear(self.inputs[-1], self.layers[-1].weight, self.layers[-1].bias)
+
+    def signals(self, cotangent: th.Tensor) -> list[th.Tensor]:
+        """The signal Δ of shape (B, out) at each layer's output, for a cotangent of the last one."""
+        signals = [cotangent]
+        for layer, activation in zip(self.layers[:0:-1], self.activations[::-1], strict=True):
+            signals.append(activation.backward(th.mm(signals[-1], layer.weight)))
+        return signals[::-1]
+
+    def write_gradients(self, signals: list[th.Tensor]) -> None:
+        """Set each layer's gradients to Δᵀ H and Δᵀ 1."""
+        for layer, signal, features in zip(self.layers, signals, self.inputs, strict=True):
+            th.mm(signal.T, features, out=layer.weight.grad)
+            th.sum(signal, 0, out=layer.bias.grad)
+
+
+class GaussianHead:
+    """Diagonal Gaussian with a log σ that does not depend on the state.
+
+    :param policy: has ``log_std``
+    """
+
+    def __init__(self, policy: Any):
+        self.log_std = policy.log_std
+
+    def forward(self, mean: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return log π(a|s) = -½ Σ ((a - μ) / σ)² - Σ log σ - ½ A log 2π, shape (B,)."""
+        self._scale = th.exp(-self.log_std)
+        self._z = (actions - mean) * self._scale
+        self._squares = self._z * self._z
+        self._log_det = self.log_std.sum() + 0.5 * _LOG_2PI * mean.shape[1]
+        return self._squares.sum(1).mul_(-0.5) - self._log_det
+
+    def signal(self) -> th.Tensor:
+        """Return ∂log π/∂μ = (a - μ) / σ², shape (B, A)."""
+        return self._z * self._scale
+
+    def score(self, n_samples: int | None = None) -> th.Tensor:
+        """S = ∂log π/∂log σ = ((a - μ) / σ)² - 1 of the first n samples, shape (n, A)."""
+        return self._squares[:n_samples] - 1
+
+    def entropy_loss(self) -> th.Tensor:
+        """Minus the entropy Σ log σ + ½ A (1 + log 2π)."""
+        return -(self._log_det + 0.5 * self.log_std.numel())
+
+    def entropy_signal(self) -> None:
+        """The entropy does not depend on the mean."""
+        return None
+
+    def write_gradients(self, cotangent: th.Tensor, ent_coef: float) -> None:
+        """Set the gradient of log σ: Sᵀ c, and -ent_coef from the entropy."""
+        th.mv(self.score().T, cotangent, out=self.log_std.grad)
+        if ent_coef != 0:
+            self.log_std.grad.sub_(ent_coef)
+
+
+class LogitsHead:
+    """Categorical, multi-categorical or Bernoulli distribution; its own little graph gives the derivatives by the logits.
+
+    :param policy: has SB3's ``action_dist``
+    """
+
+    def __init__(self, policy: Any):
+        self.distribution = policy.action_dist
+
+    def forward(self, logits: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return log π(a|s), shape (B,)."""
+        with th.enable_grad():
+            self._logits = logits.detach().requires_grad_()
+            self.distribution.proba_distribution(self._logits)
+            self._log_prob: th.Tensor = self.distribution.log_prob(actions)
+            self._entropy_loss: th.Tensor = -self.distribution.entropy().mean()
+        return self._log_prob.detach()
+
+    def signal(self) -> th.Tensor:
+        """Return ∂log π/∂logits, shape (B, A)."""
+        return th.autograd.grad(self._log_prob.sum(), self._logits, retain_graph=True)[0]
+
+    def score(self, n_samples: int | None = None) -> None:
+        """There is no parameter beside the logits."""
+        return None
+
+    def entropy_loss(self) -> th.Tensor:
+        """Minus the mean entropy."""
+        return self._entropy_loss.detach()
+
+    def entropy_signal(self) -> th.Tensor:
+        """Derivative of the entropy loss by the logits, shape (B, A)."""
+        return th.autograd.grad(self._entropy_loss, self._logits, retain_graph=True)[0]
+
+    def write_gradients(self, cotangent: th.Tensor, ent_coef: float) -> None:
+        """Nothing to set."""
+
+
+class OneBackward:
+    """An actor-critic of linear layers, evaluated and differentiated by hand: what ``Evaluation`` does, at PPO's price.
+
+    Call :meth:`evaluate` with a minibatch, then :meth:`gramian` and :meth:`backward`.
+
+    :param policy: must fit, see :meth:`fits`
+    """
+
+    def __init__(self, policy: Any):
+        self.policy = policy
+        self.actor, self.critic = Mlp(*_actor_modules(policy)), Mlp(*_critic_modules(policy))
+        gaussian = isinstance(policy.action_dist, DiagGaussianDistribution)
+        self.head: GaussianHead | LogitsHead = GaussianHead(policy) if gaussian else LogitsHead(policy)
+        self._parameters = list(policy.parameters())
+        # One block of memory for all gradients: their norm and their scaling are then one operation each.
+        self._flat = th.zeros(sum(parameter.numel() for parameter in self._parameters), device=policy.device)
+        pieces = self._flat.split([parameter.numel() for parameter in self._parameters])
+        self._views = [piece.view_as(p) for piece, p in zip(pieces, self._parameters, strict=True)]
+
+    @staticmethod
+    def fits(policy: Any) -> bool:
+        """Whether SB3's own forward pass runs in this policy, through linear layers and known activations alone."""
+        overridable = ("evaluate_actions", "extract_features", "_get_action_dist_from_latent", "_build_mlp_extractor")
+        if any(getattr(type(policy), name, None) is not getattr(ActorCriticPolicy, name) for name in overridable):
+            return False
+        heads = (DiagGaussianDistribution, CategoricalDistribution, MultiCategoricalDistribution, BernoulliDistribution)
+        if type(policy.action_dist) not in heads or type(policy.mlp_extractor) is not MlpExtractor:
+            return False
+        if not (Mlp.fits(*_actor_modules(policy)) and Mlp.fits(*_critic_modules(policy))):
+            return False
+        if not all(_only_flattens(e) for e in (policy.pi_features_extractor, policy.vf_features_extractor)):
+            return False
+        modules = [m for m in (*_actor_modules(policy), *_critic_modules(policy)) if isinstance(m, nn.Linear)]
+        known = {p for m in modules for p in (m.weight, m.bias)} | {getattr(policy, "log_std", None)}
+        return all(p in known and p.requires_grad and p.dtype == th.float32 for p in policy.parameters())
+
+    def evaluate(self, observations: Any, actions: th.Tensor) -> OneBackward:
+        """Forward pass of actor and critic; sets ``values`` (B, K) and ``log_prob`` (B,)."""
+        with th.no_grad():
+            features = BasePolicy.extract_features(self.policy, observations, self.policy.pi_features_extractor)
+            self.values = self.critic.forward(features)
+            self.log_prob = self.head.forward(self.actor.forward(features), actions)
+        return self
+
+    def gramian(self, cotangents: th.Tensor, n_samples: int | None = None) -> th.Tensor:
+        """Gramian of the component gradients, shape (K, K).
+
+        :param cotangents: of log π, shape (B, K)
+        :param n_samples: take the first n rows of the minibatch instead of all; they are in random order already
+        """
+        self._signals = self.actor.signals(self.head.signal())
+        with th.no_grad():
+            signals = [signal[:n_samples] for signal in self._signals]
+            inputs = [features[:n_samples] for features in self.actor.inputs]
+            return layer_gramian(signals, inputs, self.head.score(n_samples), cotangents[:n_samples])
+
+    def entropy_loss(self) -> th.Tensor:
+        """PPO's entropy loss: minus the mean entropy."""
+        return self.head.entropy_loss()
+
+    @th.no_grad()
+    def backward(self, cotangent: th.Tensor, value_cotangents: th.Tensor, ent_coef: float) -> None:
+        """Set the gradient of the whole loss; call :meth:`gramian` before.
+
+        :param cotangent: of log π, shape (B,)
+        :param value_cotangents: of the values, shape (B, K)
+        :param ent_coef: weight of the entropy loss
+        """
+        for parameter, view in zip(self._parameters, self._views, strict=True):
+            parameter.grad = view
+        entropy_signal = self.head.entropy_signal() if ent_coef != 0 else None
+        if entropy_signal is None:
+            column = cotangent.unsqueeze(1)
+            signals = [signal * column for signal in self._signals]
+        else:
+            signals = self.actor.signals(self._signals[-1] * cotangent.unsqueeze(1) + ent_coef * entropy_signal)
+        self.actor.write_gradients(signals)
+        self.critic.write_gradients(self.critic.signals(value_cotangents))
+        self.head.write_gradients(cotangent, ent_coef)
+
+    def clip_gradients(self, max_norm: float) -> th.Tensor:
+        """Scale all gradients down to a joint norm of at most ``max_norm``, as ``clip_grad_norm_``; the norm before."""
+        norm = self._flat.norm()
+        self._flat.mul_((max_norm / (norm + 1e-6)).clamp(max=1.0))
+        return norm
+
+
+def layer_gramian(
+    signals: list[th.Tensor], inputs: list[th.Tensor], score: th.Tensor | None, cotangents: th.Tensor
+) -> th.Tensor:
+    """Gramian of the K gradients Σ_b c_b^(k) (δ_b h_bᵀ, δ_b, s_b) over all layers; per layer the cheaper of two exact forms.
+
+    :param signals: Δ of each layer, shapes (B, out)
+    :param inputs: H of each layer, shapes (B, in)
+    :param score: S, shape (B, A), or None
+    :param cotangents: c, shape (B, K)
+    :return: G, shape (K, K)
+    """
+    n_samples, n_objectives = cotangents.shape
+    by_samples = [
+        n_samples * (signal.shape[1] + features.shape[1]) <= 2 * n_objectives * signal.shape[1] * features.shape[1]
+        for signal, features in zip(signals, inputs, strict=True)
+    ]
+    pairs = list(zip(signals, inputs, strict=True))
+    gramian = _gramian_by_samples([p for p, take in zip(pairs, by_samples, strict=True) if take], score, cotangents)
+    for (signal, features), take in zip(pairs, by_samples, strict=True):
+        if not take:
+            gramian += _gramian_by_weights(signal, features, cotangents)
+    return gramian
+
+
+def _gramian_by_samples(
+    layers: list[tuple[th.Tensor, th.Tensor]], score: th.Tensor | None, cotangents: th.Tensor
+) -> th.Tensor:
+    """C M Cᵀ with M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ + 1) + S Sᵀ, a block of rows at a time; of the symmetric M only the upper half."""
+    one = cotangents.new_ones(1, 1)
+    gramian = cotangents.new_zeros(cotangents.shape[1], cotangents.shape[1])
+    n_samples = len(cotangents)
+    height = n_samples if n_samples <= WHOLE else WHOLE // 2
+    for start in range(0, n_samples, height):
+        rows, columns = slice(start, start + height), slice(start, n_samples)
+        block = None if score is None else th.mm(score[rows], score[columns].T)
+        for signal, features in layers:
+            products = th.mm(signal[rows], signal[columns].T)
+            overlaps = th.addmm(one, features[rows], features[columns].T)
+            block = products.mul_(overlaps) if block is None else block.addcmul_(products, overlaps)
+        if block is None:
+            break
+        left = cotangents[rows]
+        width = len(left)
+        gramian += left.T @ (block[:, :width] @ left)
+        if start + width < n_samples:
+            off_diagonal = left.T @ (block[:, width:] @ cotangents[start + width :])
+            gramian += off_diagonal + off_diagonal.T
+    return gramian
+
+
+def _gramian_by_weights(signal: th.Tensor, features: th.Tensor, cotangents: th.Tensor) -> th.Tensor:
+    """J Jᵀ with the K weight gradients (Δ ∘ c^(k))ᵀ H as rows, a block of output units at a time."""
+    n_samples, n_objectives = cotangents.shape
+    block = BLOCK if signal.device.type == "cpu" else BLOCK_ON_DEVICE
+    width = max(1, block // (n_objectives * max(n_samples, features.shape[1])))
+    gramian = cotangents.new_zeros(n_objectives, n_objectives)
+    for units in signal.T.split(width):
+        weighted = (cotangents.T.unsqueeze(1) * units).flatten(0, 1)  # (K · units, B)
+        jacobian = th.mm(weighted, features).view(n_objectives, -1)
+        biases = th.mm(cotangents.T, units.T)
+        gramian += jacobian @ jacobian.T + biases @ biases.T
+    return gramian
+
+
+def _actor_modules(policy: Any) -> list[nn.Module]:
+    return [*policy.mlp_extractor.policy_net, policy.action_net]
+
+
+def _critic_modules(policy: Any) -> list[nn.Module]:
+    return [*policy.mlp_extractor.value_net, policy.value_net]
+
+
+def _only_flattens(extractor: nn.Module) -> bool:
+    """Whether a features extractor is one of SB3's that only flatten and concatenate."""
+    if type(extractor) is CombinedExtractor:
+        return all(type(part) is nn.Flatten for part in extractor.extractors.values())
+    return type(extractor) is FlattenExtractor

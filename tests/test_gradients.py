@@ -1,0 +1,235 @@
+"""Losses, cotangents and Gramians against autograd and naive loops."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_gcr.gradients import (
+    ManyBackwards,
+    clipped_surrogates,
+    gramian_by_passes,
+    surrogate_cotangents,
+    value_errors,
+)
+from sb3_gcr.one_backward import ACTIVATIONS, OneBackward, layer_gramian
+from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from tests.envs import ACTIONS, OBSERVATIONS
+
+B, K = 24, 5
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "loss", "slope"),
+    [
+        # inside the range: -ρ A; outside: -clip(ρ) A without slope only where clipping makes it larger
+        (1.0, 2.0, -2.0, -2.0),
+        (1.1, 2.0, -2.2, -2.2),
+        (1.5, 2.0, -2.4, 0.0),
+        (1.5, -2.0, 3.0, 3.0),
+        (0.5, 2.0, -1.0, -1.0),
+        (0.5, -2.0, 1.6, 0.0),
+        (1.3, 0.0, 0.0, 0.0),
+    ],
+)
+def test_surrogate_by_hand(ratio: float, advantage: float, loss: float, slope: float) -> None:
+    log_prob, old = th.tensor([np.log(ratio)]), th.zeros(1)
+    advantages = th.tensor([[advantage]], dtype=th.double)
+    assert clipped_surrogates(log_prob, old, advantages, 0.2).item() == pytest.approx(loss)
+    assert surrogate_cotangents(log_prob, old, advantages, 0.2).item() == pytest.approx(slope)
+
+
+def test_cotangents_are_the_derivative_of_the_surrogates() -> None:
+    th.manual_seed(0)
+    log_prob = (0.4 * th.randn(B, dtype=th.double)).requires_grad_()
+    old, advantages = 0.4 * th.randn(B, dtype=th.double), th.randn(B, K, dtype=th.double)
+    losses = clipped_surrogates(log_prob, old, advantages, 0.2)
+    for k in range(K):
+        (expected,) = th.autograd.grad(losses[k], log_prob, retain_graph=True)
+        th.testing.assert_close(surrogate_cotangents(log_prob, old, advantages, 0.2)[:, k], expected)
+
+
+def test_the_sum_of_clipped_surrogates_is_never_below_the_joint_one() -> None:
+    th.manual_seed(1)
+    log_prob, advantages = 0.5 * th.randn(200), th.randn(200, K)
+    joint = clipped_surrogates(log_prob, th.zeros(200), advantages.sum(1, keepdim=True), 0.2)
+    assert clipped_surrogates(log_prob, th.zeros(200), advantages, 0.2).sum() > joint.sum()
+
+
+@pytest.mark.parametrize("clip_range_vf", [None, 0.3])
+def test_value_errors_against_autograd(clip_range_vf: float | None) -> None:
+    th.manual_seed(0)
+    values = th.randn(B, K, requires_grad=True)
+    old, returns = values.detach() + 0.4 * th.randn(B, K), th.randn(B, K)
+    predicted = values if clip_range_vf is None else old + (values - old).clamp(-clip_range_vf, clip_range_vf)
+    expected = ((predicted - returns) ** 2).mean(0)
+    losses, cotangents = value_errors(values.detach(), old, returns, clip_range_vf)
+    th.testing.assert_close(losses, expected.detach())
+    th.testing.assert_close(cotangents, th.autograd.grad(expected.sum(), values)[0])
+
+
+def test_gramian_by_passes_is_a_naive_double_loop() -> None:
+    th.manual_seed(0)
+    net, unused = nn.Sequential(nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 1)), nn.Parameter(th.ones(2))
+    x, cotangents = th.randn(B, 3), th.randn(B, K)
+    parameters = [*net.parameters(), unused]
+    jacobian = []
+    for k in range(K):
+        net.zero_grad()
+        for b in range(B):
+            (cotangents[b, k] * net(x[b : b + 1]).sum()).backward()
+        jacobian.append(th.cat([p.grad.flatten().clone() for p in net.parameters() if p.grad is not None]))
+    expected = th.stack(jacobian) @ th.stack(jacobian).T
+    actual = gramian_by_passes(net(x)[:, 0], cotangents, parameters)
+    th.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
+
+
+class Dropping(BaseFeaturesExtractor):
+    """Has parameters, batch normalisation and dropout."""
+
+    def __init__(self, observation_space: gym.Space[Any]):
+        super().__init__(observation_space, 6)
+        self.net = nn.Sequential(nn.Linear(4, 6), nn.BatchNorm1d(6), nn.Dropout(0.1))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return self.net(x)  # type: ignore[no-any-return]
+
+
+class OwnForward(MlpPolicy):
+    """A user's policy with its own way through the networks."""
+
+    def evaluate_actions(self, obs: Any, actions: th.Tensor) -> Any:
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        return values, 0.5 * log_prob, entropy
+
+
+def make(policy_class: Any = MlpPolicy, observation: str = "Box", action: str = "Box", **kwargs: Any) -> Any:
+    th.manual_seed(0)
+    policy = policy_class(OBSERVATIONS[observation], ACTIONS[action], lambda _: 1e-3, n_objectives=K, **kwargs)
+    with th.no_grad():  # SB3 starts the action head close to zero, where nothing would be tested
+        policy.action_net.weight.normal_(0, 0.5)
+    space = OBSERVATIONS[observation]
+    space.seed(0)
+    samples = [space.sample() for _ in range(B)]
+    if isinstance(space, gym.spaces.Dict):
+        stacked: Any = {key: np.stack([np.asarray(sample[key]) for sample in samples]) for key in space}
+    else:
+        stacked = np.stack(samples)
+    return policy, policy.obs_to_tensor(stacked)[0]
+
+
+FITTING = {
+    "default": {},
+    "no hidden layer": {"net_arch": []},
+    "uneven": {"net_arch": {"pi": [7], "vf": [5, 6, 4]}},
+    "separate extractors": {"share_features_extractor": False},
+    "discrete": {"action": "Discrete"},
+    "multi-discrete": {"action": "MultiDiscrete"},
+    "multi-binary": {"action": "MultiBinary"},
+    "discrete observations": {"observation": "Discrete"},
+    "multi-discrete observations": {"observation": "MultiDiscrete"},
+    "dictionary": {"observation": "Dict", "policy_class": MultiInputPolicy},
+    **{activation.__name__: {"activation_fn": activation} for activation in ACTIVATIONS},
+}
+OTHERS = {
+    "batch norm and dropout": {"features_extractor_class": Dropping},
+    "gSDE": {"use_sde": True},
+    "images": {"observation": "Image", "policy_class": CnnPolicy},
+    "dictionary with image": {"observation": "DictImage", "policy_class": MultiInputPolicy},
+    "own forward": {"policy_class": OwnForward},
+    "random activation": {"activation_fn": nn.RReLU},
+    "activation with parameters": {"activation_fn": nn.PReLU},
+    "activation across features": {"activation_fn": nn.Softmax},
+}
+
+
+@pytest.mark.parametrize("name", list(FITTING))
+@pytest.mark.parametrize("ent_coef", [0.0, 0.7])
+def test_one_backward_is_k_backwards(name: str, ent_coef: float) -> None:
+    """Values, log π, entropy, Gramian, the resolved gradient and its clipping, to float32 rounding."""
+    policy, observations = make(**FITTING[name])
+    policy.set_training_mode(True)
+    assert OneBackward.fits(policy)
+    with th.no_grad():
+        actions = policy(observations)[0]
+    if FITTING[name].get("action") == "Discrete":
+        actions = actions.flatten()
+    cotangents, value_cotangents = th.randn(B, K), th.randn(B, K)
+    weights = th.rand(K)
+    results = []
+    for networks in (ManyBackwards(policy).evaluate(observations, actions), OneBackward(policy).evaluate(observations, actions)):
+        gramian = networks.gramian(cotangents)
+        subset = networks.gramian(cotangents, n_samples=10)
+        numbers = [networks.values, networks.log_prob, networks.entropy_loss().reshape(())]
+        networks.backward(cotangents @ weights, value_cotangents, ent_coef)
+        norm = networks.clip_gradients(0.5)
+        gradients = [parameter.grad.clone() for parameter in policy.parameters()]
+        results.append([t.detach() for t in (gramian, subset, *numbers, norm, *gradients)])
+    for expected, actual in zip(*results, strict=True):
+        th.testing.assert_close(actual, expected, rtol=2e-4, atol=2e-5 * max(1.0, float(expected.abs().max())))
+
+
+@pytest.mark.parametrize("name", list(OTHERS))
+@pytest.mark.filterwarnings("ignore:Implicit dimension choice for softmax")
+def test_everything_else_takes_k_backwards(name: str) -> None:
+    policy, observations = make(**OTHERS[name])
+    assert not OneBackward.fits(policy)
+    policy.set_training_mode(True)
+    with th.no_grad():
+        actions = th.zeros(B, 2)
+    networks = ManyBackwards(policy).evaluate(observations, actions)
+    gramian = networks.gramian(th.randn(B, K))
+    assert (th.linalg.eigvalsh(gramian) > -1e-4 * gramian.diagonal().max()).all()
+    networks.backward(th.randn(B), th.randn(B, K), 0.1)
+    assert policy.value_net.weight.grad.abs().sum() > 0
+
+
+def test_frozen_and_double_parameters_do_not_fit() -> None:
+    policy, _ = make()
+    policy.action_net.weight.requires_grad_(False)
+    assert not OneBackward.fits(policy)
+    policy, _ = make()
+    assert not OneBackward.fits(policy.double())
+    policy, _ = make()
+    policy.extra = nn.Parameter(th.zeros(1))
+    assert not OneBackward.fits(policy)
+    policy, _ = make()
+    policy.action_net.register_forward_hook(lambda *_: None)
+    assert not OneBackward.fits(policy)
+
+
+@pytest.mark.parametrize(
+    ("n_samples", "n_objectives", "sizes"),
+    [
+        (40, 3, [(5, 4), (4, 2)]),
+        (700, 3, [(90, 80), (80, 2)]),
+        (1500, 2, [(3, 300), (300, 40)]),
+        (600, 12, [(200, 200)]),
+    ],
+)
+@pytest.mark.parametrize("block", [2**10, 2**22])
+@pytest.mark.parametrize("with_score", [True, False])
+def test_both_forms_of_the_gramian(
+    monkeypatch: pytest.MonkeyPatch, n_samples: int, n_objectives: int, sizes: Any, block: int, with_score: bool
+) -> None:
+    """Small and large minibatches, in one block or many, against the Jacobian written out."""
+    monkeypatch.setattr("sb3_gcr.one_backward.BLOCK", block)
+    th.manual_seed(0)
+    cotangents = th.randn(n_samples, n_objectives, dtype=th.double)
+    signals = [th.randn(n_samples, out, dtype=th.double) for _, out in sizes]
+    inputs = [th.randn(n_samples, size, dtype=th.double) for size, _ in sizes]
+    score = th.randn(n_samples, 2, dtype=th.double) if with_score else None
+    rows = []
+    for k in range(n_objectives):
+        c = cotangents[:, k]
+        parts = [th.einsum("b,bo,bi->oi", c, s, h).flatten() for s, h in zip(signals, inputs, strict=True)]
+        parts += [c @ s for s in signals] + ([c @ score] if score is not None else [])
+        rows.append(th.cat(parts))
+    expected = th.stack(rows) @ th.stack(rows).T
+    th.testing.assert_close(layer_gramian(signals, inputs, score, cotangents), expected)

@@ -1,0 +1,293 @@
+"""Numbers, guarantees and counter-examples of the resolvers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_gcr import RESOLVERS
+from sb3_gcr.resolvers import conflicts, cosines, from_torchjd, gcr, gcr_authors, guaranteed, no_priority, visiting_order
+from tests.oracles import authors_in_place, pcgrad_with_levels, random_jacobian
+
+TASK, REGULARISER = 0, 1
+TORCHJD_MATRIX = np.array([[-4.0, 1.0, 1.0], [6.0, 1.0, 1.0]])
+
+
+def step(resolver: Any, jacobian: Any, levels: Any, rng: Any = None) -> Any:
+    jacobian = np.asarray(jacobian, dtype=float)
+    rng = rng or np.random.default_rng(0)
+    return resolver(jacobian @ jacobian.T, np.asarray(levels), rng) @ jacobian
+
+
+def all_steps(resolver: Any, jacobian: Any, levels: Any, draws: int = 200) -> Any:
+    return np.array([step(resolver, jacobian, levels, np.random.default_rng(seed)) for seed in range(draws)])
+
+
+@pytest.mark.parametrize("name", list(RESOLVERS))
+@pytest.mark.parametrize("levels", [[0, 0, 0], [0, 1, 1], [2, 0, 1]])
+def test_no_conflict_gives_ones(name: str, levels: list[int]) -> None:
+    for jacobian in (np.eye(3), np.array([[1.0, 0.2], [1.0, 0.1], [0.5, 0.4]]), np.zeros((3, 2))):
+        weights = RESOLVERS[name](jacobian @ jacobian.T, np.array(levels), np.random.default_rng(0))
+        np.testing.assert_array_equal(weights, np.ones(3))
+
+
+@pytest.mark.parametrize("name", list(RESOLVERS))
+def test_orthogonal_up_to_rounding_is_no_conflict(name: str) -> None:
+    rng = np.random.default_rng(1)
+    basis = np.linalg.qr(rng.normal(size=(6, 6)))[0] * np.exp(3 * rng.normal(size=(6, 1)))
+    weights = RESOLVERS[name](basis @ basis.T, np.array([0, 0, 1, 1, 2, 2]), rng)
+    np.testing.assert_array_equal(weights, np.ones(6))
+
+
+@pytest.mark.parametrize("levels", [[0] * 5, [0, 0, 1, 1, 1], [0, 1, 1, 2, 3], [1, 0, 2, 0, 1]])
+@pytest.mark.parametrize("seed", range(10))
+def test_gcr_is_the_papers_projection_in_gradient_space(levels: list[int], seed: int) -> None:
+    jacobian = random_jacobian(np.random.default_rng(seed), 5, 4)
+    expected = pcgrad_with_levels(jacobian, levels, np.random.default_rng(seed))
+    np.testing.assert_allclose(step(gcr, jacobian, levels, np.random.default_rng(seed)), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("levels", [[0, 0, 0, 1, 1], [0, 1, 1, 1, 0]])
+@pytest.mark.parametrize("seed", range(10))
+def test_gcr_authors_is_the_released_rule_in_gradient_space(levels: list[int], seed: int) -> None:
+    jacobian = random_jacobian(np.random.default_rng(seed), 5, 4)
+    expected = authors_in_place(jacobian, levels, np.random.default_rng(seed))
+    actual = step(gcr_authors, jacobian, levels, np.random.default_rng(seed))
+    np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_level_zero_is_visited_last() -> None:
+    levels = np.array([2, 0, 1, 0, 1])
+    for seed in range(20):
+        for row in visiting_order(levels, np.random.default_rng(seed)):
+            assert levels[row].tolist() == [2, 1, 1, 0, 0]
+    orders = {tuple(visiting_order(levels, np.random.default_rng(seed))[0]) for seed in range(50)}
+    assert len(orders) == 4  # every order inside the two levels of two
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gcr_on_one_level_is_no_priority(seed: int) -> None:
+    jacobian = random_jacobian(np.random.default_rng(seed), 5, 3)
+    for level in (0, 3):
+        same = step(gcr, jacobian, [level] * 5, np.random.default_rng(seed))
+        np.testing.assert_array_equal(same, step(no_priority, jacobian, [0, 1, 2, 1, 0], np.random.default_rng(seed)))
+
+
+@pytest.mark.parametrize("name", ["gcr", "guaranteed"])
+@settings(max_examples=200, deadline=None)
+@given(seed=st.integers(0, 2**31), n=st.integers(2, 7), size=st.integers(2, 8), log_scale=st.floats(-8, 8))
+def test_one_task_is_never_weakened(name: str, seed: int, n: int, size: int, log_scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    jacobian = random_jacobian(rng, n, size) * 10**log_scale
+    task = int(rng.integers(n))
+    levels = np.where(np.arange(n) == task, TASK, rng.integers(1, 4, n))
+    descent = step(RESOLVERS[name], jacobian, levels, rng) @ jacobian[task]
+    assert descent >= jacobian[task] @ jacobian[task] * (1 - 1e-6) - 1e-9 * np.abs(jacobian @ jacobian[task]).sum()
+
+
+@pytest.mark.parametrize("name", ["gcr", "gcr_authors", "no_priority"])
+def test_sequential_projections_only_raise_weights(name: str) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        jacobian = random_jacobian(rng, 6, 5)
+        levels = np.array([0, 0, 1, 1, 1, 1])
+        weights = RESOLVERS[name](jacobian @ jacobian.T, levels, rng)
+        if name != "gcr_authors" or not conflicts(jacobian[:2] @ jacobian[:2].T).any():
+            assert (weights >= 1).all()
+
+
+def test_two_conflicting_tasks_lose_under_sequential_projection() -> None:
+    """The counter-example: with two tasks that conflict a regulariser can undo one of them, whatever the order."""
+    jacobian, levels = np.array([[1, 0], [-0.6, 0.8], [-3, -3]]), [TASK, TASK, REGULARISER]
+    found = {tuple(np.round(row, 6) + 0.0) for row in all_steps(gcr, jacobian, levels)}
+    assert found == {(-0.8, 0.2), (0.64, -1.24)}
+    assert np.dot((-0.8, 0.2), jacobian[0]) == pytest.approx(-0.80)
+    assert np.dot((0.64, -1.24), jacobian[1]) == pytest.approx(-1.376)
+    alone = step(gcr, jacobian[:2], levels[:2])
+    np.testing.assert_allclose(alone @ jacobian[:2].T, [0.64, 0.64])
+
+
+def test_guaranteed_keeps_both_conflicting_tasks() -> None:
+    jacobian = np.array([[1, 0], [-0.6, 0.8], [-3, -3]])
+    direction = step(guaranteed, jacobian, [TASK, TASK, REGULARISER])
+    np.testing.assert_allclose(direction, [0.64, 1.28], atol=1e-9)
+    np.testing.assert_allclose(direction @ jacobian[:2].T, [0.64, 0.64], atol=1e-9)
+
+
+def test_in_place_projection_makes_two_tasks_lose() -> None:
+    jacobian = np.array([[1.0, 0.0], [-0.7, np.sqrt(1 - 0.49)]])
+    gains = all_steps(gcr_authors, jacobian, [TASK, TASK]) @ jacobian.T
+    assert gains.min() == pytest.approx(-0.19, abs=0.005)
+    np.testing.assert_allclose(all_steps(gcr, jacobian, [TASK, TASK]) @ jacobian.T, 0.51, atol=0.005)
+
+
+def test_published_pcgrad_weights() -> None:
+    weights = gcr(TORCHJD_MATRIX @ TORCHJD_MATRIX.T, np.array([0, 0]), np.random.default_rng(0))
+    np.testing.assert_allclose(weights, [2.2222, 1.5789], atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_guaranteed_never_harms_a_higher_level(seed: int) -> None:
+    """What one level adds to the levels above it decreases none of their components."""
+    rng = np.random.default_rng(seed)
+    jacobian = random_jacobian(rng, 8, 6)
+    levels = np.array([0, 0, 0, 1, 1, 2, 2, 3])
+    below = np.zeros(6)
+    for level in range(4):
+        up_to = step(guaranteed, jacobian[levels <= level], levels[levels <= level])
+        for member in jacobian[levels < level]:
+            assert (up_to - below) @ member >= -1e-8 * np.linalg.norm(up_to) * np.linalg.norm(member)
+        if level == 0:
+            assert (up_to @ jacobian[levels == 0].T >= -1e-8 * np.linalg.norm(up_to)).all()
+        below = up_to
+
+
+def test_guaranteed_solves_its_projections() -> None:
+    """Optimality conditions of the cone projection of a regulariser: λ ≥ 0, no harm, and λ_j > 0 only where the gain is 0."""
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        tasks, regulariser = np.abs(rng.normal(size=(3, 5))), rng.normal(size=(1, 5))
+        jacobian = np.vstack([tasks, regulariser])  # tasks do not conflict with each other
+        weights = guaranteed(jacobian @ jacobian.T, np.array([0, 0, 0, 1]), rng)
+        multipliers = weights[:3] - 1
+        gains = tasks @ (regulariser[0] + multipliers @ tasks)
+        assert weights[3] == pytest.approx(1)
+        assert (multipliers >= -1e-9).all()
+        assert (gains >= -1e-6).all()
+        assert np.abs(multipliers * gains).max() < 1e-6
+
+
+def test_guaranteed_takes_the_smallest_weights_where_they_are_not_unique() -> None:
+    jacobian = np.array([[1.0, 0.0], [1.0, 0.0], [-4.0, 1.0]])
+    weights = guaranteed(jacobian @ jacobian.T, np.array([0, 0, 1]), np.random.default_rng(0))
+    np.testing.assert_allclose(weights, [3, 3, 1], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", list(RESOLVERS))
+def test_permuting_components_permutes_the_weights(name: str) -> None:
+    rng = np.random.default_rng(5)
+    jacobian = random_jacobian(rng, 3, 4)
+    jacobian[1] = -0.8 * jacobian[0] + 0.1 * jacobian[1]
+    levels, order = np.array([0, 1, 2]), np.array([2, 0, 1])  # one component a level, so that nothing is drawn
+    if name in ("no_priority", "gcr_authors"):  # order matters: compare what all draws reach
+        all_draws = [RESOLVERS[name](jacobian @ jacobian.T, levels, np.random.default_rng(s))[order] for s in range(300)]
+        permuted = jacobian[order]
+        again = [RESOLVERS[name](permuted @ permuted.T, levels[order], np.random.default_rng(s)) for s in range(300)]
+        assert {tuple(w.round(6)) for w in all_draws} == {tuple(w.round(6)) for w in again}
+        return
+    weights = RESOLVERS[name](jacobian @ jacobian.T, levels, np.random.default_rng(0))
+    permuted = jacobian[order]
+    again = RESOLVERS[name](permuted @ permuted.T, levels[order], np.random.default_rng(1))
+    np.testing.assert_allclose(again, weights[order], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", list(RESOLVERS))
+@pytest.mark.parametrize("scale", [1e-8, 1e-4, 1e4, 1e8])
+def test_scaling_all_gradients_leaves_the_weights(name: str, scale: float) -> None:
+    jacobian = random_jacobian(np.random.default_rng(7), 6, 4)
+    levels = np.array([0, 0, 1, 1, 2, 2])
+    weights = RESOLVERS[name](jacobian @ jacobian.T, levels, np.random.default_rng(0))
+    scaled = RESOLVERS[name]((scale * jacobian) @ (scale * jacobian).T, levels, np.random.default_rng(0))
+    np.testing.assert_allclose(scaled, weights, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", list(RESOLVERS))
+def test_a_component_without_gradient_is_skipped(name: str) -> None:
+    jacobian = np.array([[1.0, 0.0], [0.0, 0.0], [-1.0, 1.0], [-1.0, -1.0]])
+    levels = np.array([0, 0, 1, 1])
+    weights = RESOLVERS[name](jacobian @ jacobian.T, levels, np.random.default_rng(0))
+    others = [0, 2, 3]
+    alone = RESOLVERS[name](jacobian[others] @ jacobian[others].T, levels[others], np.random.default_rng(0))
+    assert np.isfinite(weights).all()
+    assert weights[1] == 1
+    if name in ("sum", "guaranteed"):
+        np.testing.assert_allclose(weights[others], alone)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_opposed_and_rank_one_gradients(scale: float) -> None:
+    """A regulariser straight against the task vanishes; gradients of one direction are a question of sign alone."""
+    jacobian = scale * np.array([[1.0, 2.0], [-3.0, -6.0], [0.5, 1.0]])
+    for resolver in (gcr, guaranteed):
+        direction = step(resolver, jacobian, [TASK, REGULARISER, TASK])
+        np.testing.assert_allclose(direction, scale * np.array([1.5, 3.0]), rtol=1e-6)
+
+
+def test_share_of_draws_in_which_a_task_gets_worse() -> None:
+    """4 tasks, 3 regularisers, D = 10, Gaussian directions, log-normal norms with sd 1; seed 0, 2000 draws.
+
+    The share with no regulariser-regulariser projection in gradient space is METHOD's 10 %; ours adds that projection.
+    """
+    rng = np.random.default_rng(0)
+    levels = np.array([0] * 4 + [1] * 3)
+    worse = {"sum": 0, "gcr": 0, "gcr_authors": 0, "guaranteed": 0}
+    draws = 2000
+    for _ in range(draws):
+        jacobian = random_jacobian(rng, 7, 10)
+        for name in worse:
+            gains = jacobian[:4] @ step(RESOLVERS[name], jacobian, levels, rng)
+            worse[name] += bool((gains < -1e-6 * np.linalg.norm(jacobian, axis=1).max() ** 2).any())
+    share = {name: count / draws for name, count in worse.items()}
+    assert share["guaranteed"] == 0
+    assert share["sum"] == pytest.approx(0.65, abs=0.04)
+    assert share["gcr_authors"] == pytest.approx(0.31, abs=0.04)
+    assert share["gcr"] == pytest.approx(0.10, abs=0.04)
+
+
+def test_conflicts_and_cosines() -> None:
+    jacobian = np.array([[1.0, 0.0], [-2.0, 2.0], [0.0, 0.0]])
+    gramian = jacobian @ jacobian.T
+    assert conflicts(gramian).tolist() == [[False, True, False], [True, False, False], [False, False, False]]
+    np.testing.assert_allclose(cosines(gramian), [[1, -(0.5**0.5), 0], [-(0.5**0.5), 1, 0], [0, 0, 0]])
+
+
+torchjd = pytest.importorskip("torchjd.aggregation")
+
+
+@pytest.mark.parametrize(
+    ("weighting", "expected"),
+    [
+        (lambda: torchjd.PCGradWeighting(), (2.2222, 1.5789)),
+        (lambda: torchjd.UPGradWeighting(), (1.1109, 0.7894)),
+        (lambda: torchjd.DualProjWeighting(), (0.6109, 0.5)),
+        (lambda: torchjd.MGDAWeighting(), (0.6, 0.4)),
+        (lambda: torchjd.CAGradWeighting(c=0.5), (0.7041, 0.5)),
+    ],
+    ids=["PCGrad", "UPGrad", "DualProj", "MGDA", "CAGrad"],
+)
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_published_torchjd_weights_at_any_scale(weighting: Any, expected: Any, scale: float) -> None:
+    """The values for scale 1 are TorchJD's published ones; the adapter must not lose them for small gradients."""
+    jacobian = scale * TORCHJD_MATRIX
+    weights = from_torchjd(weighting())(jacobian @ jacobian.T, np.array([0, 1]), np.random.default_rng(0))
+    np.testing.assert_allclose(weights, expected, atol=1e-3 if scale != 1 else 4e-4)
+
+
+def test_torchjd_adapter_keeps_the_preference_and_the_users_object() -> None:
+    import torch as th
+
+    weighting = torchjd.UPGradWeighting(pref_vector=th.ones(2))
+    resolver = from_torchjd(weighting)
+    jacobian = np.array([[1.0, 0.0], [-6e-4, 8e-4]])
+    weights = resolver(jacobian @ jacobian.T, np.array([0, 0]), np.random.default_rng(0))
+    expected = guaranteed(jacobian @ jacobian.T, np.array([0, 0]), np.random.default_rng(0))
+    np.testing.assert_allclose(weights, expected, rtol=1e-3)
+    assert weighting.pref_vector.tolist() == [1, 1]
+
+
+def test_torchjd_adapter_skips_a_zero_row_and_refuses_an_aggregator() -> None:
+    jacobian = np.array([[1.0, 0.0], [0.0, 0.0], [-1.0, 1.0]])
+    weights = from_torchjd(torchjd.UPGradWeighting())(jacobian @ jacobian.T, np.zeros(3, int), np.random.default_rng(0))
+    assert weights[1] == 1
+    zeros = from_torchjd(torchjd.MGDAWeighting())(np.zeros((2, 2)), np.zeros(2, int), np.random.default_rng(0))
+    assert zeros.tolist() == [1, 1]
+    message = (
+        r"Parameter `weighting` must be a torchjd.aggregation.\*Weighting, found UPGrad. "
+        r"Aggregators such as UPGrad\(\) carry theirs as `.gramian_weighting`."
+    )
+    with pytest.raises(TypeError, match=f"^{message}$"):
+        from_torchjd(torchjd.UPGrad())
