@@ -28,7 +28,7 @@ def parse_arguments() -> argparse.Namespace:
     """Options of the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--rows", nargs="+", choices=GROUPS, default=list(GROUPS), metavar="GROUP", help=", ".join(GROUPS))
-    parser.add_argument("--only", metavar="TEXT", default="", help="only rows whose setting and names contain this text")
+    parser.add_argument("--bars", action="store_true", help="only the rows that have a bar to clear")
     parser.add_argument("--pairs", type=int, default=25, help="pairs per row, at most (default: %(default)s)")
     parser.add_argument(
         "--seconds", type=float, default=8.0, help="time per row after which 5 pairs do (default: %(default)s)"
@@ -47,7 +47,7 @@ def limit_threads(threads: int) -> None:
     os.environ["OMP_NUM_THREADS"] = str(threads)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the rows that it appears in are rows of the CPU
     if threads == 1:
-        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 
 
 def measure(cases: list[Case], pairs: int, seconds: float) -> tuple[list[Row], list[str], bool]:
@@ -78,7 +78,7 @@ def main() -> int:
         machine, rows, absent = report.load(arguments.load)
     else:
         limit_threads(arguments.threads)
-        cases = [case for group in arguments.rows for case in GROUPS[group]()]
+        cases = [case for group in arguments.rows for case in GROUPS[group]() if case.bar or not arguments.bars]
         start = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
             os.environ["SB3_LOGDIR"] = folder  # where the loggers without a folder of their own write

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 from benchmarks.measuring import Case
 from benchmarks.rollouts import Setting
@@ -18,7 +19,7 @@ def cases(setting: Setting = GPU, gramian_samples: int = 2048) -> list[Case]:
     :param setting: what to update
     :param gramian_samples: size of the subset in the rows with one
     """
-    subset = {"note": f" gramian_samples={gramian_samples}", "gramian_samples": gramian_samples}
+    subset: dict[str, Any] = {"note": f" gramian_samples={gramian_samples}", "gramian_samples": gramian_samples}
     rows = []
     for k in (7, 20):
         exact, few = partial(gcrppo, setting, k), partial(gcrppo, setting, k, **subset)

@@ -17,7 +17,7 @@ def sbx_ppo() -> Any:
 
 
 def sbx_update(setting: Setting, n_components: int) -> Contestant:
-    """``train()`` of ``sbx.PPO`` on the summed advantages, always from the same weights and with the same minibatches.
+    """``train()`` of ``sbx.PPO`` on the summed advantages, always from the same weights, with the same minibatches.
 
     sbx keeps weights and optimiser in two immutable flax ``TrainState`` of its policy, ``actor_state`` and ``vf_state``.
     """

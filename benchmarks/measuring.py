@@ -108,12 +108,13 @@ def timed(
         synchronize(device)
         # As timeit does: a collection that happens to fall into one of the two would be charged to it alone.
         gc.disable()
-        start = time.perf_counter()
-        run()
-        synchronize(device)
-        seconds = time.perf_counter() - start
-        gc.enable()
-        return seconds / calls
+        try:
+            start = time.perf_counter()
+            run()
+            synchronize(device)
+            return (time.perf_counter() - start) / calls
+        finally:
+            gc.enable()
 
     return measure
 

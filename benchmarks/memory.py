@@ -24,7 +24,10 @@ def peak_of_process(n_components: int, method: str | None = None) -> Contestant:
     command = ["sh", "-c", '"$@"; exit $?', "sh", sys.executable, "-m", "benchmarks.memory", *arguments]
 
     def measure() -> float:
-        return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        process = subprocess.run(command, capture_output=True, text=True)
+        if process.returncode != 0:
+            raise RuntimeError(process.stderr.strip().splitlines()[-1])
+        return float(process.stdout)
 
     return Contestant(f"GCRPPO K={n_components}" + (f" {method}" if method else ""), measure)
 

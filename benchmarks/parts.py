@@ -52,11 +52,11 @@ def buffer_by_buffer(n_components: int) -> Contestant:
 def resolver_alone(name: str, n_components: int) -> Contestant:
     """One resolver on Gramians with half of their pairs in conflict."""
     rng = np.random.default_rng(SEED)
-    signals = [mixed_signals(SAMPLES, n_components, rng).astype(float) for _ in range(GRAMIANS)]
-    gramians = [signal.T @ signal for signal in signals]
+    signals = mixed_signals(GRAMIANS * SAMPLES, n_components, rng).reshape(GRAMIANS, SAMPLES, n_components).astype(float)
+    gramians = signals.mT @ signals
     levels = (2 * np.arange(n_components) >= n_components).astype(int)
-    pairs = np.triu_indices(n_components, 1)
-    share = float(np.mean([(gramian[pairs] < 0).mean() for gramian in gramians]))
+    first, second = np.triu_indices(n_components, 1)
+    share = float((gramians[:, first, second] < 0).mean())
     resolve = RESOLVERS[name]
 
     def run() -> None:

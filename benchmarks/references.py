@@ -65,7 +65,7 @@ class FlatProjection(LossByLoss):
             gradients = th.autograd.grad(loss, self.actor, retain_graph=True)
             rows.append(th.cat([gradient.flatten() for gradient in gradients]))
         step = project_in_place(rows, self.levels, self.rng)
-        pieces = step.split([weight.numel() for weight in self.actor])
+        pieces = step.split_with_sizes([weight.numel() for weight in self.actor])
         for weight, piece in zip(self.actor, pieces, strict=True):
             weight.grad = piece.view_as(weight)
 

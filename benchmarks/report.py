@@ -20,8 +20,8 @@ PACKAGES = ("sb3_gcr", "torch", "stable_baselines3", "numpy", "gymnasium", "mujo
 #: Columns of the table that hold words.
 WORDS = 4
 EXPLANATION = (
-    "ratio: cost of the row over cost of what it is compared with, below 1 is cheaper; median of interleaved pairs, then their "
-    "quartiles.\nconflicts: measured share of component pairs whose gradients point against each other, one half by design."
+    "ratio: time or memory of the row over that of what it is compared with, below 1 is cheaper; median of interleaved pairs, "
+    "then their quartiles.\nconflicts: share of component pairs whose gradients point against each other, half by design."
 )
 
 
@@ -76,7 +76,7 @@ def table(rows: Sequence[Row], earlier: Sequence[Row] | None = None) -> str:
     :param rows: at least one
     :param earlier: rows of another run; adds its ratios and how much each has changed
     """
-    head = ["group", "setting", "row", "compared with", "cost", "its cost", "unit", "ratio", "quartiles", "conflicts", "bar"]
+    head = ["group", "setting", "row", "compared with", "measured", "other", "unit", "ratio", "quartiles", "conflicts", "bar"]
     if earlier is not None:
         head += ["earlier", "change"]
     before = {row.name: row.ratio for row in earlier or ()}
@@ -91,21 +91,24 @@ def table(rows: Sequence[Row], earlier: Sequence[Row] | None = None) -> str:
 
 
 def _cells(row: Row) -> list[str]:
-    shown = [UNITS[row.unit](value) for value in row.medians]
-    digits = 2 if min(shown) < 10 else 1 if min(shown) < 100 else 0
     low, high = row.quartiles
     return [
         row.group,
         row.setting,
         row.subject,
         row.baseline,
-        *(f"{value:.{digits}f}" for value in shown),
+        *(_number(UNITS[row.unit](value)) for value in row.medians),
         row.unit,
-        f"{row.ratio:.2f}",
+        f"{row.ratio:.2f}" if row.ratio > 0.1 else f"{row.ratio:.3f}",
         f"{low:.2f} – {high:.2f}",
         "" if row.conflict_rate is None else f"{100 * row.conflict_rate:.0f} %",
         "" if row.bar is None else f"≤ {row.bar:.2f} {'met' if row.ratio <= row.bar else 'MISSED'}",
     ]
+
+
+def _number(value: float) -> str:
+    """Three digits or more, never an exponent."""
+    return f"{value:.{2 if value < 10 else 1 if value < 100 else 0}f}"
 
 
 def _aligned(lines: Sequence[Sequence[str]]) -> str:

@@ -22,7 +22,7 @@ SEED = 0
 #: Shared random signals that the component advantages are mixed from; even, so that a pair can also be orthogonal.
 SIGNALS = 4
 #: Draws of the sign pattern, of which the one with nearest to one half of conflicting pairs is taken.
-DRAWS = 2000
+DRAWS = 500
 #: Standard deviation of each component's own noise, in units of that of its mixture.
 NOISE = 0.5
 
@@ -147,7 +147,7 @@ def evaluate(policy: Any, rollout: Rollout) -> tuple[Array, Array]:
 def torch_update(
     label: str, algorithm: Callable[..., OnPolicyAlgorithm], setting: Setting, n_components: int, **kwargs: Any
 ) -> Contestant:
-    """``train()`` of a PyTorch algorithm on the synthetic rollout, always from the same weights and with the same minibatches."""
+    """``train()`` of a PyTorch algorithm on the synthetic rollout, always from the same weights, with the same minibatches."""
     model = make_model(algorithm, setting, n_components, **kwargs)
     rollout = make_rollout(setting, n_components)
     values, log_probs = evaluate(model.policy, rollout)

@@ -41,10 +41,10 @@ def component_gae(
     gamma: float,
     gae_lambda: float,
 ) -> FloatArray:
-    """Generalised advantage estimation, once per component (METHOD: component GAE; arXiv:1506.02438).
+    r"""Generalised advantage estimation, once per component (METHOD: component GAE; arXiv:1506.02438).
 
     .. math::
-        δ_t^{(k)} = r_t^{(k)} + γ (1 - d_t) V^{(k)}(s_{t+1}) - V^{(k)}(s_t), \\qquad
+        δ_t^{(k)} = r_t^{(k)} + γ (1 - d_t) V^{(k)}(s_{t+1}) - V^{(k)}(s_t), \qquad
         A_t^{(k)} = δ_t^{(k)} + γ λ (1 - d_t) A_{t+1}^{(k)}
 
     :param rewards: shape (T, N, K)
@@ -69,9 +69,9 @@ def component_gae(
 
 
 def joint_scale(advantages: ArrayT, eps: float = 1e-8, kappa_max: float = np.inf) -> Any:
-    """One scale for all components: the summed advantage gets unit variance, ratios between components are kept.
+    r"""One scale for all components: the summed advantage gets unit variance, ratios between components are kept.
 
-    .. math:: κ = 1 / \\max(σ(\\textstyle\\sum_k A^{(k)}) + ε,\\ \\max_k σ(A^{(k)}) / κ_{max})
+    .. math:: κ = 1 / \max(σ(\textstyle\sum_k A^{(k)}) + ε,\ \max_k σ(A^{(k)}) / κ_{max})
 
     The second term bounds κ where components cancel and the variance of their sum vanishes. σ has ddof 1, as in PPO.
 

@@ -250,7 +250,9 @@ def find_fault(components: NDArray[Any], rewards: NDArray[Any], spec: RewardSpec
     with np.errstate(invalid="ignore"):
         total = components.sum(1)
         allowed = tolerance * (np.abs(components).sum(1) + np.abs(rewards))
-        healthy = np.abs(total - rewards) <= allowed if tolerance < np.inf else np.isfinite(total)
+        healthy = np.isfinite(total)
+        if tolerance < np.inf:
+            healthy &= np.abs(total - rewards) <= allowed
     if healthy.all():
         return None
     index = int(np.argmin(healthy))
@@ -275,9 +277,10 @@ def find_reward_spec(env: VecEnv) -> RewardSpec | None:
     spec = getattr(env, "reward_spec", None)
     if spec is not None:
         return _as_spec(spec)
-    if not env.has_attr("reward_spec"):
+    found = env.get_attr("reward_spec") if env.has_attr("reward_spec") else [None]
+    if all(spec is None for spec in found):
         return None
-    specs = [_as_spec(spec) for spec in env.get_attr("reward_spec")]
+    specs = [_as_spec(spec) for spec in found]
     for index, other in enumerate(specs):
         if other != specs[0]:
             raise ValueError(

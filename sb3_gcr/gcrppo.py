@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, TensorBoardOutputFormat
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import explained_variance, obs_as_tensor, safe_mean, update_learning_rate
+from stable_baselines3.common.utils import explained_variance, obs_as_tensor, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gcr.advantages import bootstrap_truncations, joint_scale, normalize_jointly
@@ -55,7 +55,7 @@ FIGURE_INTERVAL = 10
 
 
 class GCRPPO(PPO):
-    """PPO with gradient conflict resolution (GCR-PPO, arXiv:2509.14816): one critic head, advantage and gradient per component.
+    """PPO with gradient conflict resolution (GCR-PPO, arXiv:2509.14816): a critic head, advantage and gradient per component.
 
     The env must report its reward components (see :class:`~sb3_gcr.components.RewardDecomposition`); an id of Gymnasium's
     MuJoCo envs such as ``"Humanoid-v5"`` is taken apart by itself. Without components it is SB3's PPO. All parameters of
@@ -67,8 +67,8 @@ class GCRPPO(PPO):
         than one component and "minibatch", as in PPO, for one
     :param kappa_max: bound of κ · max_k std(A^(k)), for components that cancel each other
     :param desired_kl: target of the learning rate that follows the KL divergence; None keeps ``learning_rate``
-    :param gramian_method: "one_backward" for actors of linear layers, "passes" (K backward passes) for any network; "auto" takes
-        the first where it fits. Both give the same numbers
+    :param gramian_method: "one_backward" for actors of linear layers, "passes" (K backward passes) for any network; "auto"
+        takes the first where it fits. Both give the same numbers
     :param gramian_samples: number of samples of each minibatch that the weights are taken from, for large networks and
         batches; the step takes all of them. None is exact
     :raises ValueError: for an unknown resolver or scope, a wrong policy class, a spec that does not match a loaded model
@@ -282,7 +282,8 @@ class GCRPPO(PPO):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        assert self.env is not None and self.reward_spec is not None
+        assert self.env is not None
+        assert self.reward_spec is not None
         if self.n_objectives > 1 and find_reward_spec(self.env) is None:
             raise ValueError(
                 f"The env reports no reward components, but the model has {self.n_objectives}: {self.reward_spec}. "

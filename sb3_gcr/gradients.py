@@ -1,7 +1,7 @@
 """The component losses, their cotangents, and the Gramian of their gradients.
 
-All K surrogates share one log π(a_b|s_b), so the gradient of component k is Σ_b c_b^(k) ∇_θ log π(a_b|s_b): its cotangent c^(k)
-is all that distinguishes it. The step of any weights w is one backward pass with the cotangent c w.
+All K surrogates share one log π(a_b|s_b), so the gradient of component k is Σ_b c_b^(k) ∇_θ log π(a_b|s_b): its cotangent
+c^(k) is all that distinguishes it. The step of any weights w is one backward pass with the cotangent c w.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import torch as th
 
 
 def clipped_surrogates(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
-    """PPO's clipped surrogate loss of each component, to be minimised; one ratio ρ for all of them.
+    r"""PPO's clipped surrogate loss of each component, to be minimised; one ratio ρ for all of them.
 
-    .. math:: L^{(k)} = -\\frac{1}{B} \\sum_b \\min(ρ_b Â_b^{(k)}, \\mathrm{clip}(ρ_b, 1-ε, 1+ε) Â_b^{(k)})
+    .. math:: L^{(k)} = -\frac{1}{B} \sum_b \min(ρ_b Â_b^{(k)}, \mathrm{clip}(ρ_b, 1-ε, 1+ε) Â_b^{(k)})
 
     :param log_prob: log π(a_b|s_b) of the current policy, shape (B,)
     :param old_log_prob: the same of the policy that collected the data, shape (B,)
@@ -28,7 +28,7 @@ def clipped_surrogates(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages:
 
 
 def surrogate_cotangents(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
-    """Derivative of :func:`clipped_surrogates` by log π: c_b^(k) = ∂L^(k)/∂log π_b = -ρ_b Â_b^(k) / B where not clipped, else 0.
+    """Derivative of :func:`clipped_surrogates` by log π: c_b^(k) = ∂L^(k)/∂log π_b = -ρ_b Â_b^(k) / B, or 0 where clipped.
 
     :param log_prob: shape (B,)
     :param old_log_prob: shape (B,)
@@ -50,9 +50,9 @@ def _surrogates(
 def value_errors(
     values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range_vf: float | None
 ) -> tuple[th.Tensor, th.Tensor]:
-    """Mean squared error of each value head and its derivative by the values; the change of a head is clipped as in SB3's PPO.
+    r"""Mean squared error of each value head and its derivative; the change of a head is clipped as in SB3's PPO.
 
-    .. math:: L_V^{(k)} = \\frac{1}{B} \\sum_b (V_b^{(k)} - Ĝ_b^{(k)})^2
+    .. math:: L_V^{(k)} = \frac{1}{B} \sum_b (V_b^{(k)} - Ĝ_b^{(k)})^2
 
     with V replaced by V_old + clip(V - V_old, -c, c) if a ``clip_range_vf`` c is given.
 

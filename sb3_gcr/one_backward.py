@@ -100,8 +100,7 @@ class Mlp:
     def fits(*modules: nn.Module) -> bool:
         """Whether the modules are linear layers and known activations in turn, without hooks."""
         right_types = [
-            type(module) is nn.Linear and module.bias is not None
-            if index % 2 == 0 else type(module) in ACTIVATIONS
+            type(module) is nn.Linear and module.bias is not None if index % 2 == 0 else type(module) in ACTIVATIONS
             for index, module in enumerate(modules)
         ]
         hooked = any(module._forward_hooks or module._forward_pre_hooks or module._backward_hooks for module in modules)
@@ -321,7 +320,7 @@ def layer_gramian(
 def _gramian_by_samples(
     layers: list[tuple[th.Tensor, th.Tensor]], score: th.Tensor | None, cotangents: th.Tensor
 ) -> th.Tensor:
-    """C M Cᵀ with M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ + 1) + S Sᵀ, a block of rows at a time; of the symmetric M only the upper half."""
+    """C M Cᵀ with M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ + 1) + S Sᵀ, by blocks of rows; of the symmetric M only the upper half."""
     one = cotangents.new_ones(1, 1)
     gramian = cotangents.new_zeros(cotangents.shape[1], cotangents.shape[1])
     n_samples = len(cotangents)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -41,7 +42,7 @@ class Env(gym.Env[Any, Any]):
         limit: int = 12,
         p_end: float = 0.05,
     ):
-        self.observation_space, self.action_space = OBSERVATIONS[observation], ACTIONS[action]
+        self.observation_space, self.action_space = deepcopy((OBSERVATIONS[observation], ACTIONS[action]))
         self.limit, self.p_end = limit, p_end
         self.n = 3 if spec is None else len(spec)
         if spec is not None:
@@ -104,6 +105,8 @@ class Terms(gym.Env[Any, Any]):
 
 class BatchedEnv(VecEnv):
     """A VecEnv that offers its components as one (N, K) array and returns no infos at all."""
+
+    render_mode = None
 
     def __init__(self, num_envs: int = 4):
         super().__init__(num_envs, OBSERVATIONS["Box"], ACTIONS["Box"])

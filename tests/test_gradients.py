@@ -163,7 +163,10 @@ def test_one_backward_is_k_backwards(name: str, ent_coef: float) -> None:
     cotangents, value_cotangents = th.randn(B, K), th.randn(B, K)
     weights = th.rand(K)
     results = []
-    for networks in (ManyBackwards(policy).evaluate(observations, actions), OneBackward(policy).evaluate(observations, actions)):
+    for networks in (
+        ManyBackwards(policy).evaluate(observations, actions),
+        OneBackward(policy).evaluate(observations, actions),
+    ):
         gramian = networks.gramian(cotangents)
         subset = networks.gramian(cotangents, n_samples=10)
         numbers = [networks.values, networks.log_prob, networks.entropy_loss().reshape(())]
