@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.measuring import Case
 from benchmarks.rollouts import Setting
-from benchmarks.updates import FLAT, gcrppo
+from benchmarks.updates import FLAT, gcrppo, ppo
 
 BATCH = 24_576
 GPU = Setting((400, 200, 100), BATCH, n_samples=4 * BATCH, n_epochs=5, device="cuda")
@@ -29,6 +29,7 @@ def cases(setting: Setting = GPU, gramian_samples: int = 2048) -> list[Case]:
             (exact, plain, 2.5 if k == 20 else None),
             (few, flat, None),
             (exact, flat, None),
+            (exact, partial(ppo, setting, k), None),
         ):
             rows.append(Case("gpu", str(setting), subject, baseline, bar, needs=("cuda",)))
     return rows

@@ -89,6 +89,19 @@ def gramian_by_passes(log_prob: th.Tensor, cotangents: th.Tensor, parameters: Se
     return jacobian @ jacobian.T
 
 
+def kl_and_clip_fraction(log_prob: th.Tensor, old_log_prob: th.Tensor, clip_range: float) -> tuple[th.Tensor, th.Tensor]:
+    """KL(old ‖ current) by the estimator mean((ρ - 1) - log ρ), and the share of samples with abs(ρ - 1) > ε.
+
+    :param log_prob: shape (B,)
+    :param old_log_prob: shape (B,)
+    :param clip_range: ε
+    :return: two numbers, as in SB3's PPO
+    """
+    log_ratio = log_prob - old_log_prob
+    excess = th.exp(log_ratio) - 1
+    return (excess - log_ratio).mean(), (excess.abs() > clip_range).float().mean()
+
+
 class ManyBackwards:
     """An actor-critic of any kind, evaluated with SB3's ``evaluate_actions`` and differentiated with K + 1 backward passes.
 

@@ -78,11 +78,11 @@ class Activation:
     def backward(self, signal: th.Tensor) -> th.Tensor:
         """Signal in front of the activation from the one behind it."""
         if isinstance(self.module, nn.Tanh):
-            return _aten.tanh_backward(signal, self._output)  # type: ignore[no-any-return]
+            return _aten.tanh_backward(signal, self._output)
         if isinstance(self.module, nn.ReLU):
-            return _aten.threshold_backward(signal, self._output, 0)  # type: ignore[no-any-return]
+            return _aten.threshold_backward(signal, self._output, 0)
         if isinstance(self.module, nn.ELU):
-            return _aten.elu_backward(signal, self.module.alpha, 1, 1, True, self._output)  # type: ignore[no-any-return]
+            return _aten.elu_backward(signal, self.module.alpha, 1, 1, True, self._output)
         return th.autograd.grad(self._output, self._input, signal, retain_graph=True)[0]
 
 

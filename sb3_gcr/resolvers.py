@@ -8,7 +8,9 @@ Level 0 has the highest priority. Nothing here has the size of the network.
 from __future__ import annotations
 
 import copy
+import inspect
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -246,3 +248,33 @@ RESOLVERS: dict[str, Resolver] = {
     "sum": plain_sum,
     "guaranteed": guaranteed,
 }
+
+
+def bind_resolver(resolver: str | Resolver, resolver_kwargs: dict[str, Any] | None) -> Resolver:
+    """The callable behind a resolver's name, with its keyword arguments bound.
+
+    :param resolver: a name in ``RESOLVERS``, or a callable
+    :param resolver_kwargs: keyword arguments of the callable
+    :raises ValueError: for an unknown name
+    :raises TypeError: for what is not callable, and for keyword arguments that do not fit
+    """
+    if isinstance(resolver, str):
+        if resolver not in RESOLVERS:
+            raise ValueError(
+                f"Parameter `resolver` must be one of {sorted(RESOLVERS)} or a callable "
+                f"(gramian, levels, rng) -> weights, found {resolver!r}."
+            )
+        resolver = RESOLVERS[resolver]
+    if not callable(resolver):
+        raise TypeError(
+            f"Parameter `resolver` must be one of {sorted(RESOLVERS)} or a callable "
+            f"(gramian, levels, rng) -> weights, found {resolver!r}."
+        )
+    try:
+        inspect.signature(resolver).bind(None, None, None, **(resolver_kwargs or {}))
+    except TypeError as error:
+        raise TypeError(
+            f"Parameter `resolver_kwargs` must fit the resolver's signature (gramian, levels, rng, ...), "
+            f"found {resolver_kwargs!r}: {error}."
+        ) from None
+    return partial(resolver, **(resolver_kwargs or {}))

@@ -18,35 +18,35 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 REVIEWED = {
-    (PPO, "__init__"): "e5dc2a3ec0ea",
-    (PPO, "_setup_model"): "3eadd6fa7bef",
-    (PPO, "train"): "c15fc60a06f4",
-    (PPO, "learn"): "14f3a3585e64",
-    (OnPolicyAlgorithm, "_setup_model"): "c78bcf109c28",
-    (OnPolicyAlgorithm, "_maybe_recommend_cpu"): "f36f8d1ad4e6",
-    (OnPolicyAlgorithm, "collect_rollouts"): "09638559a70d",
-    (OnPolicyAlgorithm, "dump_logs"): "6deb3e96fc2e",
-    (BaseAlgorithm, "_excluded_save_params"): "7a6cc8b6049a",
-    (BaseAlgorithm, "_get_policy_from_name"): "8bf7f38faaf5",
-    (BaseAlgorithm, "_setup_learn"): "046e4c1ed033",
-    (BaseAlgorithm, "_update_learning_rate"): "49ee53488615",
-    (BaseAlgorithm, "load"): "bdb2adbee75f",
-    (BaseAlgorithm, "save"): "d0e1b80df84b",
-    (BaseAlgorithm, "set_env"): "ca0edc808158",
-    (BaseAlgorithm, "set_random_seed"): "be86d2e27087",
-    (ActorCriticPolicy, "_build"): "254a5d13487e",
-    (ActorCriticPolicy, "_get_constructor_parameters"): "48d213848c33",
-    (ActorCriticPolicy, "_get_action_dist_from_latent"): "257b1ee4cc5b",
-    (ActorCriticPolicy, "evaluate_actions"): "1546a913cc01",
-    (BasePolicy, "extract_features"): "ba54d728fa0d",
-    (RolloutBuffer, "reset"): "75073a3bb62f",
-    (RolloutBuffer, "add"): "f7744f96609b",
-    (RolloutBuffer, "get"): "4511b8697883",
-    (RolloutBuffer, "compute_returns_and_advantage"): "0677212ed6ed",
-    (DictRolloutBuffer, "add"): "879c3665f2f6",
-    (VecNormalize, "normalize_reward"): "df4fbeae1e35",
-    (VecNormalize, "step_wait"): "b063880f71c4",
-    (None, "evaluate_policy"): "0c9558a987c1",
+    (PPO, "__init__"): "9149f29c4465",
+    (PPO, "_setup_model"): "b63eabb97579",
+    (PPO, "train"): "744e951f0ff6",
+    (PPO, "learn"): "f2d9e9d25b6c",
+    (OnPolicyAlgorithm, "_setup_model"): "f4350385d82e",
+    (OnPolicyAlgorithm, "_maybe_recommend_cpu"): "6eac4f54b045",
+    (OnPolicyAlgorithm, "collect_rollouts"): "ade66a1ce768",
+    (OnPolicyAlgorithm, "dump_logs"): "6b245e0f4d2e",
+    (BaseAlgorithm, "_excluded_save_params"): "82e5c65739ba",
+    (BaseAlgorithm, "_get_policy_from_name"): "3e6820ba3f96",
+    (BaseAlgorithm, "_setup_learn"): "7eed1da120cc",
+    (BaseAlgorithm, "_update_learning_rate"): "f3a9690538a7",
+    (BaseAlgorithm, "load"): "b5180feac421",
+    (BaseAlgorithm, "save"): "63a986b4596f",
+    (BaseAlgorithm, "set_env"): "a5e6da0dc352",
+    (BaseAlgorithm, "set_random_seed"): "bd6c75e74746",
+    (ActorCriticPolicy, "_build"): "1e0564f2a405",
+    (ActorCriticPolicy, "_get_constructor_parameters"): "3c22594e38b8",
+    (ActorCriticPolicy, "_get_action_dist_from_latent"): "7344d5c35282",
+    (ActorCriticPolicy, "evaluate_actions"): "ccf6b1574512",
+    (BasePolicy, "extract_features"): "a43d6d220031",
+    (RolloutBuffer, "reset"): "de8f977b2615",
+    (RolloutBuffer, "add"): "da5ab2c5d3f5",
+    (RolloutBuffer, "get"): "2c1a9e9863ce",
+    (RolloutBuffer, "compute_returns_and_advantage"): "f64be170293e",
+    (DictRolloutBuffer, "add"): "67ccae224fa1",
+    (VecNormalize, "normalize_reward"): "ebd5e333496a",
+    (VecNormalize, "step_wait"): "a8bc18106882",
+    (None, "evaluate_policy"): "a425756913b1",
 }
 
 
@@ -56,7 +56,7 @@ def fingerprint(function: Any) -> str:
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef) and ast.get_docstring(node) is not None:
             node.body = node.body[1:]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
+    return hashlib.sha256(ast.unparse(tree).encode()).hexdigest()[:12]
 
 
 @pytest.mark.parametrize(("owner", "name"), list(REVIEWED), ids=lambda value: getattr(value, "__name__", str(value)))

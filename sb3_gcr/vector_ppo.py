@@ -1,0 +1,267 @@
+"""PPO on reward vectors: everything around the update, with a last axis of K reward components."""
+
+from __future__ import annotations
+
+import warnings
+from collections import deque
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_gcr.advantages import bootstrap_truncations
+from sb3_gcr.buffers import VectorDictRolloutBuffer, VectorRolloutBuffer
+from sb3_gcr.components import (
+    SCALAR_REWARD,
+    ComponentReader,
+    RewardSpec,
+    find_reward_spec,
+    match_specs,
+    undecomposed_id,
+)
+from sb3_gcr.diagnostics import component_table
+from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiHeadActorCriticPolicy, MultiInputPolicy
+
+
+class VectorPPO(PPO):
+    """SB3's PPO with a critic head and a return per reward component; the update is left to a subclass.
+
+    With one component, and nothing that asks for more, SB3's own code runs.
+
+    :param args: the arguments of SB3's PPO
+    :param kwargs: the keyword arguments of SB3's PPO
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+
+    #: Names and levels of the reward components.
+    reward_spec: RewardSpec
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        self.ep_component_buffer: deque[NDArray[np.float64]] = deque(maxlen=kwargs.get("stats_window_size", 100))
+        self._episode_components: NDArray[np.float64] | None = None
+        super().__init__(*args, **kwargs)
+
+    @property
+    def n_objectives(self) -> int:
+        """Number K of reward components."""
+        return len(self.reward_spec)
+
+    @property
+    def _is_plain_ppo(self) -> bool:
+        """Whether SB3's own rollouts and update run."""
+        return self.n_objectives == 1
+
+    def _setup_model(self) -> None:
+        if any(base.__module__.startswith("sb3_contrib") for base in self.policy_class.__mro__):
+            raise ValueError(_wrong_policy_message(self.policy_class.__name__))
+        self._adopt_reward_spec()
+        if self._is_plain_ppo:
+            super()._setup_model()
+            return
+        given = {name: getattr(self, name) for name in ("policy_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs")}
+        self._choose_vector_classes()
+        super()._setup_model()
+        self.__dict__.update(given)  # what a model saves is what its constructor was given
+
+    def _adopt_reward_spec(self) -> None:
+        """Take over the env's spec, or check it against the one that a loaded model was made with."""
+        found = None if self.env is None else find_reward_spec(self.env)
+        if "reward_spec" in self.__dict__:
+            self.reward_spec = match_specs(self.reward_spec, found)
+            return
+        self.reward_spec = found or SCALAR_REWARD
+        env_id = None if self.env is None else undecomposed_id(self.env)
+        if env_id is not None:
+            warnings.warn(
+                f"'{env_id}' reports the terms of its reward, but nothing collects them, so GCRPPO trains one objective. "
+                "Add the line `env = RewardDecomposition(env)`, or `make_vec_env(..., wrapper_class=RewardDecomposition)`.",
+                stacklevel=2,
+            )
+
+    def _choose_vector_classes(self) -> None:
+        """Let SB3's setup build a policy and a buffer with K heads."""
+        if not issubclass(self.policy_class, MultiHeadActorCriticPolicy):
+            if self.n_objectives > 1:
+                raise ValueError(_wrong_policy_message(self.policy_class.__name__))
+        else:
+            self.policy_kwargs = {**self.policy_kwargs, "n_objectives": self.n_objectives}
+        if self.rollout_buffer_class is None:
+            is_dict = isinstance(self.observation_space, spaces.Dict)
+            self.rollout_buffer_class = VectorDictRolloutBuffer if is_dict else VectorRolloutBuffer
+        elif not issubclass(self.rollout_buffer_class, VectorRolloutBuffer):
+            raise ValueError(
+                "Parameter `rollout_buffer_class` must be a subclass of VectorRolloutBuffer for more than one reward "
+                f"component, found {self.rollout_buffer_class.__name__}."
+            )
+        self.rollout_buffer_kwargs = {**self.rollout_buffer_kwargs, "n_objectives": self.n_objectives}
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ValueError(_wrong_policy_message(policy_name))
+        return self.policy_aliases[policy_name]
+
+    def _maybe_recommend_cpu(self, mlp_class_name: str = MlpPolicy.__name__) -> None:
+        super()._maybe_recommend_cpu(mlp_class_name)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """SB3's ``set_env``; the reward components must be those of the model, their order may differ.
+
+        :param env: the environment to learn from
+        :param force_reset: reset it before training
+        :raises ValueError: if the names differ
+        """
+        env = self._wrap_env(env, self.verbose)
+        spec = match_specs(self.reward_spec, find_reward_spec(env))
+        super().set_env(env, force_reset)
+        self.reward_spec = spec
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_reader"]
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        assert self.env is not None
+        if self.n_objectives > 1 and find_reward_spec(self.env) is None:
+            raise ValueError(
+                f"The env reports no reward components, but the model has {self.n_objectives}: {self.reward_spec}. "
+                "Wrap it with `RewardDecomposition`, or set another with `set_env`; `predict` works without."
+            )
+        resets = reset_num_timesteps or self._last_obs is None
+        if resets or self._episode_components is None:
+            self._episode_components = np.zeros((self.env.num_envs, self.n_objectives))
+        if reset_num_timesteps:
+            self.ep_component_buffer = deque(maxlen=self._stats_window_size)
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        self._reader = ComponentReader(self.env, self.reward_spec)
+        if self.n_objectives > 1:
+            self.logger.info(f"{self.n_objectives} reward components: {self.reward_spec}")
+        else:
+            self.logger.info("One reward component: training is SB3's PPO with one objective.")
+        return result
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """SB3's ``collect_rollouts`` with reward components; a callback's ``locals["values"]`` has shape (N, K).
+
+        :param env: training env
+        :param callback: called at each step
+        :param rollout_buffer: buffer to fill
+        :param n_rollout_steps: number of steps per env
+        :return: False if the callback stopped the rollout
+        :raises ValueError: if the components of a step are missing, not finite, or do not sum to the reward
+        """
+        if self._is_plain_ppo:
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        assert self._last_obs is not None, "No previous observation was provided"
+        self.policy.set_training_mode(False)
+        rollout_buffer.reset()
+        if self.use_sde:
+            self.policy.reset_noise(env.num_envs)
+        callback.on_rollout_start()
+        for n_steps in range(n_rollout_steps):
+            if self.use_sde and self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0:
+                self.policy.reset_noise(env.num_envs)
+            with th.no_grad():
+                obs_tensor = obs_as_tensor(self._last_obs, self.device)  # type: ignore[arg-type]
+                actions, values, log_probs = self.policy(obs_tensor)
+            actions = actions.cpu().numpy()
+            clipped_actions = self._to_env_actions(actions)
+            new_obs, rewards, dones, infos = env.step(clipped_actions)
+            self.num_timesteps += env.num_envs
+            reward_components, original_components = self._read_components(rewards, infos)
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+            self._count_components(original_components, dones)
+            reward_components = self._bootstrap(reward_components, dones, infos)
+            rollout_buffer.add(self._last_obs, actions, reward_components, self._last_episode_starts, values, log_probs)  # type: ignore[arg-type]
+            self._last_obs = new_obs  # type: ignore[assignment]
+            self._last_episode_starts = dones
+        with th.no_grad():
+            values = self.policy.predict_values(obs_as_tensor(new_obs, self.device))  # type: ignore[arg-type]
+        rollout_buffer.compute_returns_and_advantage(last_values=values, dones=dones)
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _to_env_actions(self, actions: NDArray[Any]) -> NDArray[Any]:
+        """Bring the policy's actions into the bounds of the action space."""
+        if not isinstance(self.action_space, spaces.Box):
+            return actions
+        if self.policy.squash_output:
+            return self.policy.unscale_action(actions)
+        return np.clip(actions, self.action_space.low, self.action_space.high)
+
+    def _read_components(self, rewards: NDArray[Any], infos: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+        if self.n_objectives == 1:  # a VecEnv may then return no infos at all
+            return rewards[:, None], rewards[:, None]
+        return self._reader.read(rewards, infos, self.num_timesteps)
+
+    def _count_components(self, components: NDArray[Any], dones: NDArray[np.bool_]) -> None:
+        """Keep the return of each component per episode, in the units of the env."""
+        assert self._episode_components is not None
+        self._episode_components += components
+        self.ep_component_buffer.extend(self._episode_components[dones])
+        self._episode_components[dones] = 0.0
+
+    def _bootstrap(self, components: NDArray[Any], dones: NDArray[np.bool_], infos: Any) -> NDArray[Any]:
+        """Add the value of the terminal observation where a time limit ended the episode, all of them in one forward pass."""
+        truncated = np.zeros(len(dones), dtype=bool)
+        for index in np.flatnonzero(dones):
+            info = infos[index] if len(infos) else {}
+            truncated[index] = info.get("TimeLimit.truncated", False) and info.get("terminal_observation") is not None
+        if not truncated.any():
+            return components
+        terminal = [infos[index]["terminal_observation"] for index in np.flatnonzero(truncated)]
+        if isinstance(terminal[0], dict):
+            observations: Any = {key: np.stack([row[key] for row in terminal]) for key in terminal[0]}
+        else:
+            observations = np.stack(terminal)
+        with th.no_grad():
+            terminal_values = self.policy.predict_values(self.policy.obs_to_tensor(observations)[0])
+        return bootstrap_truncations(components, truncated, terminal_values.cpu().numpy(), self.gamma)
+
+    def dump_logs(self, iteration: int = 0) -> None:
+        """Write SB3's log, with the return of each component, and our own table of components.
+
+        :param iteration: current logging iteration
+        """
+        if self.n_objectives == 1:
+            super().dump_logs(iteration)
+            return
+        if self.ep_component_buffer:
+            means = np.mean(self.ep_component_buffer, axis=0)
+            for name, value in zip(self.reward_spec.names, means, strict=True):
+                self.logger.record(f"rollout/ep_rew/{name}", float(value), exclude="stdout")
+        table = component_table(self.reward_spec, self.logger.name_to_value)
+        super().dump_logs(iteration)
+        self.logger.info(table)
+
+
+def _wrong_policy_message(name: str) -> str:
+    return (
+        f"Parameter `policy` must be one of {sorted(VectorPPO.policy_aliases)} or a subclass of MultiHeadActorCriticPolicy, "
+        f"found {name!r}. Recurrent and maskable policies are not supported."
+    )
