@@ -50,6 +50,8 @@ class RewardSpec:
                 raise TypeError(f"Parameter `names` must contain strings, found {name!r}.")
             if not name:
                 raise ValueError(f"Parameter `names` must not contain an empty name, found {list(names)}.")
+            if set(name) & set(',"\r\n'):  # SB3 writes names into CSV files as they are
+                raise ValueError(f"Parameter `names` must not contain commas, quotes or line breaks, found {name!r}.")
         duplicates = sorted({name for name in names if names.count(name) > 1})
         if duplicates:
             raise ValueError(f"Parameter `names` must be unique, found {duplicates} more than once in {list(names)}.")
@@ -275,10 +277,10 @@ def find_reward_spec(env: VecEnv) -> RewardSpec | None:
     :raises ValueError: if the envs disagree
     """
     spec = getattr(env, "reward_spec", None)
-    if spec is not None:
+    if spec is not None and not callable(spec):
         return _as_spec(spec)
-    found = env.get_attr("reward_spec") if env.has_attr("reward_spec") else [None]
-    if all(spec is None for spec in found):
+    found = _attribute(env, "reward_spec")
+    if all(spec is None or callable(spec) for spec in found):  # a method of that name is somebody else's
         return None
     specs = [_as_spec(spec) for spec in found]
     for index, other in enumerate(specs):
@@ -287,6 +289,14 @@ def find_reward_spec(env: VecEnv) -> RewardSpec | None:
                 f"All envs must have the same `reward_spec`, found ({specs[0]}) in env 0 and ({other}) in env {index}."
             )
     return specs[0]
+
+
+def _attribute(env: VecEnv, name: str) -> list[Any]:
+    """An attribute of all envs, or nothing where the VecEnv has none or cannot say."""
+    try:
+        return list(env.get_attr(name)) if env.has_attr(name) else []
+    except NotImplementedError:
+        return []
 
 
 def _as_spec(spec: Any) -> RewardSpec:
@@ -299,10 +309,10 @@ def _as_spec(spec: Any) -> RewardSpec:
 
 def undecomposed_id(env: VecEnv) -> str | None:
     """Id of the first env if its reward terms are known but nobody has collected them."""
-    if find_reward_spec(env) is not None or not env.has_attr("spec"):
+    if find_reward_spec(env) is not None:
         return None
-    spec = env.get_attr("spec", 0)[0]
-    return spec.id if spec is not None and spec.id in GYMNASIUM_ENVS else None
+    ids = [getattr(spec, "id", None) for spec in _attribute(env, "spec")]
+    return ids[0] if ids and ids[0] in GYMNASIUM_ENVS else None
 
 
 def match_specs(saved: RewardSpec, found: RewardSpec | None) -> RewardSpec:
@@ -340,8 +350,7 @@ class ComponentReader:
         self._columns = [env_spec.names.index(name) for name in spec.names]
         self._batched = getattr(env, COMPONENTS_KEY, None) is not None
         self._vec_normalize = unwrap_vec_normalize(env)
-        tolerances = env.get_attr("reward_tolerance") if env.has_attr("reward_tolerance") else []
-        self._tolerance = max([SUM_TOLERANCE, *tolerances])
+        self._tolerance = max([SUM_TOLERANCE, *filter(None, _attribute(env, "reward_tolerance"))])
 
     def read(
         self, rewards: NDArray[Any], infos: Sequence[dict[str, Any]], timestep: int

@@ -81,6 +81,8 @@ def gramian_by_passes(log_prob: th.Tensor, cotangents: th.Tensor, parameters: Se
     :param parameters: candidates; those that log π does not depend on contribute nothing
     :return: G, shape (K, K)
     """
+    if not log_prob.requires_grad:  # a frozen actor
+        return cotangents.new_zeros(cotangents.shape[1], cotangents.shape[1])
     rows = []
     for cotangent in cotangents.unbind(1):
         gradients = th.autograd.grad(log_prob, parameters, cotangent, retain_graph=True, allow_unused=True)

@@ -98,14 +98,13 @@ class Mlp:
 
     @staticmethod
     def fits(*modules: nn.Module) -> bool:
-        """Whether the modules are linear layers and known activations in turn, without hooks."""
+        """Whether the modules are linear layers and known activations in turn."""
         right_types = [
             type(module) is nn.Linear and module.bias is not None if index % 2 == 0 else type(module) in ACTIVATIONS
             for index, module in enumerate(modules)
         ]
-        hooked = any(module._forward_hooks or module._forward_pre_hooks or module._backward_hooks for module in modules)
         in_place = any(getattr(module, "inplace", False) for module in modules)
-        return len(modules) % 2 == 1 and all(right_types) and not hooked and not in_place
+        return len(modules) % 2 == 1 and all(right_types) and not in_place
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """Output for features of shape (B, in); each layer's input H is kept."""
@@ -238,9 +237,13 @@ class OneBackward:
             return False
         if not all(_only_flattens(e) for e in (policy.pi_features_extractor, policy.vf_features_extractor)):
             return False
+        hooks = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+        if any(getattr(module, name) for module in policy.modules() for name in hooks):
+            return False
         modules = [m for m in (*_actor_modules(policy), *_critic_modules(policy)) if isinstance(m, nn.Linear)]
         known = {p for m in modules for p in (m.weight, m.bias)} | {getattr(policy, "log_std", None)}
-        return all(p in known and p.requires_grad and p.dtype == th.float32 for p in policy.parameters())
+        plain = (p.requires_grad and p.dtype == th.float32 and not p._backward_hooks for p in policy.parameters())
+        return all(p in known for p in policy.parameters()) and all(plain)
 
     def evaluate(self, observations: Any, actions: th.Tensor) -> OneBackward:
         """Forward pass of actor and critic; sets ``values`` (B, K) and ``log_prob`` (B,)."""

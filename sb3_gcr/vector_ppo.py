@@ -179,7 +179,8 @@ class VectorPPO(PPO):
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
         callback.on_rollout_start()
-        for n_steps in range(n_rollout_steps):
+        n_steps = 0
+        while n_steps < n_rollout_steps:
             if self.use_sde and self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0:
                 self.policy.reset_noise(env.num_envs)
             with th.no_grad():
@@ -190,11 +191,12 @@ class VectorPPO(PPO):
             new_obs, rewards, dones, infos = env.step(clipped_actions)
             self.num_timesteps += env.num_envs
             reward_components, original_components = self._read_components(rewards, infos)
+            self._count_components(original_components, dones)
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
             self._update_info_buffer(infos, dones)
-            self._count_components(original_components, dones)
+            n_steps += 1
             reward_components = self._bootstrap(reward_components, dones, infos)
             rollout_buffer.add(self._last_obs, actions, reward_components, self._last_episode_starts, values, log_probs)  # type: ignore[arg-type]
             self._last_obs = new_obs  # type: ignore[assignment]

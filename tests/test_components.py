@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_gcr import RewardDecomposition, RewardSpec
-from sb3_gcr.components import GYMNASIUM_ENVS, ComponentReader, find_reward_spec, match_specs
+from sb3_gcr.components import GYMNASIUM_ENVS, ComponentReader, find_reward_spec, match_specs, undecomposed_id
 from tests.envs import SPEC, BatchedEnv, Env, Terms
 
 LEVELS = "valid choices are ['regulariser', 'regularizer', 'task'] and integers from 0 (highest priority) on"
@@ -41,6 +41,12 @@ def test_spec_from_words_and_integers() -> None:
         ([], [], ValueError, "Parameter `names` must name at least one reward component, found none."),
         (["a", ""], [0, 0], ValueError, "Parameter `names` must not contain an empty name, found ['a', '']."),
         (["a", 3], [0, 0], TypeError, "Parameter `names` must contain strings, found 3."),
+        (
+            ["a,b"],
+            [0],
+            ValueError,
+            "Parameter `names` must not contain commas, quotes or line breaks, found 'a,b'.",
+        ),
         ("ab", [0, 0], TypeError, "Parameter `names` must be a sequence, found 'ab'."),
         (
             ["a", "b", "a"],
@@ -197,6 +203,34 @@ def test_specs_are_found_through_wrappers() -> None:
     env = Env()
     env.reward_spec = {"go": "task", "stay": 0, "save": 1}  # type: ignore[assignment]
     assert find_reward_spec(DummyVecEnv([lambda: env])) == SPEC
+
+
+class OwnVecEnv(DummyVecEnv):
+    """Answers ``get_attr`` as some simulators' VecEnvs do: no integer as indices, None or an error for what it lacks."""
+
+    def __init__(self, env_fns: Any, missing: Any):
+        self.missing = missing
+        super().__init__(env_fns)
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        n = self.num_envs if indices is None else len(indices)
+        if not hasattr(self.envs[0], attr_name):
+            if self.missing is not None:
+                raise self.missing
+            return [None] * n
+        return [getattr(self.envs[0], attr_name)] * n
+
+
+@pytest.mark.parametrize("missing", [None, NotImplementedError(), AttributeError()])
+def test_other_peoples_vec_envs(missing: Any) -> None:
+    plain = OwnVecEnv([lambda: Env(None)] * 2, missing)
+    assert find_reward_spec(plain) is None
+    assert undecomposed_id(plain) is None
+    ComponentReader(plain, SPEC)
+    assert find_reward_spec(OwnVecEnv([Env] * 2, missing)) == SPEC
+    env = Env(None)
+    env.reward_spec = lambda: "dm_env's"  # type: ignore[assignment,return-value]
+    assert find_reward_spec(DummyVecEnv([lambda: env])) is None
 
 
 def test_envs_that_disagree() -> None:

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 import torch as th
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
@@ -309,6 +309,25 @@ def test_a_callback_can_stop_training() -> None:
 
     model = GCRPPO("MlpPolicy", make_vec_env(Env, 1), **SMALL).learn(1000, callback=Stop())
     assert model.num_timesteps == 5
+
+
+def test_component_returns_after_a_callback_stopped_at_the_end_of_an_episode() -> None:
+    model = GCRPPO("MlpPolicy", make_vec_env(lambda: Env(limit=8, p_end=0.0), 1), **SMALL)
+    model.learn(64, callback=StopTrainingOnMaxEpisodes(1))
+    model.learn(64, reset_num_timesteps=False)
+    returns = [episode["r"] for episode in model.ep_info_buffer]
+    np.testing.assert_allclose(np.sum(model.ep_component_buffer, axis=1)[-len(returns) :], returns, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("action", ["Box", "Discrete"])
+def test_a_frozen_actor_lets_the_critic_warm_up(action: str) -> None:
+    model = GCRPPO("MlpPolicy", make_vec_env(lambda: Env(action=action), 1), **SMALL)
+    actor = [p for name, p in model.policy.named_parameters() if "value" not in name]
+    for parameter in actor:
+        parameter.requires_grad_(False)
+    before = [parameter.clone() for parameter in actor]
+    learned(model)
+    assert all(th.equal(old, new) for old, new in zip(before, actor, strict=True))
 
 
 def test_logged_keys(tmp_path: Path) -> None:

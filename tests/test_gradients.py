@@ -203,7 +203,10 @@ def test_frozen_and_double_parameters_do_not_fit() -> None:
     policy.extra = nn.Parameter(th.zeros(1))
     assert not OneBackward.fits(policy)
     policy, _ = make()
-    policy.action_net.register_forward_hook(lambda *_: None)
+    policy.mlp_extractor.register_forward_hook(lambda *_: None)
+    assert not OneBackward.fits(policy)
+    policy, _ = make()
+    policy.action_net.weight.register_hook(lambda gradient: 2 * gradient)
     assert not OneBackward.fits(policy)
 
 

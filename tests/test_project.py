@@ -1,0 +1,135 @@
+"""The project's own rules: which module may import which, and that what the README shows runs."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+import sb3_gcr
+
+ROOT = Path(__file__).parents[1]
+#: Modules of ours that each module may import.
+ARROWS = {
+    "advantages": set(),
+    "gradients": set(),
+    "resolvers": set(),
+    "one_backward": set(),
+    "schedules": set(),
+    "components": set(),
+    "policies": set(),
+    "buffers": {"advantages"},
+    "diagnostics": {"components", "resolvers"},
+    "evaluation": {"components"},
+    "report": {"components", "diagnostics"},
+    "vector_ppo": {"advantages", "buffers", "components", "diagnostics", "policies"},
+    "gcrppo": {
+        "advantages",
+        "components",
+        "diagnostics",
+        "gradients",
+        "one_backward",
+        "resolvers",
+        "schedules",
+        "vector_ppo",
+    },
+    "__init__": {"buffers", "components", "evaluation", "gcrppo", "policies", "resolvers"},
+}
+#: Packages that the pure modules do without.
+FORBIDDEN = {
+    "advantages": {"torch", "stable_baselines3"},
+    "resolvers": {"stable_baselines3"},
+    "gradients": {"stable_baselines3", "numpy"},
+}
+
+
+def imports(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+        elif isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+    return found
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "sb3_gcr").glob("*.py")), ids=lambda path: path.stem)
+def test_imports_point_one_way(path: Path) -> None:
+    modules = imports(path)
+    ours = {name.split(".")[1] for name in modules if name.startswith("sb3_gcr.")}
+    assert ours <= ARROWS[path.stem]
+    assert not {name.split(".")[0] for name in modules} & FORBIDDEN.get(path.stem, set())
+
+
+def test_users_of_the_package_take_the_public_way() -> None:
+    for folder in ("examples", "benchmarks"):
+        for path in (ROOT / folder).glob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sb3_gcr"):
+                    assert not [alias.name for alias in node.names if alias.name.startswith("_")]
+
+
+def test_every_public_name_exists_and_is_documented() -> None:
+    for name in sb3_gcr.__all__:
+        assert getattr(sb3_gcr, name).__doc__
+
+
+def test_import_is_silent() -> None:
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", "import sb3_gcr"], capture_output=True, text=True, check=True
+    )
+    assert result.stdout == result.stderr == ""
+
+
+def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every Python block, in one namespace, with a smaller budget."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    assert blocks
+    monkeypatch.chdir(tmp_path)
+    code = "\n".join(blocks).replace("300_000", "4_096")
+    namespace: dict[str, object] = {}
+    exec(compile(code, "README.md", "exec"), namespace)
+    namespace["model"].logger.close()  # type: ignore[attr-defined]
+    written = {path.name for path in (tmp_path / "logs/humanoid").iterdir()}
+    assert {"model.zip", "progress.csv", "cosines.csv", "returns.png", "cosines.png", "conflicts.png"} <= written
+
+
+def test_yaml_files_parse_and_the_version_is_one() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == sb3_gcr.__version__
+    assert f"## {sb3_gcr.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+    assert yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+
+
+def test_make_lists_its_commands_and_refuses_without_python() -> None:
+    listed = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for command in ("train", "test", "check", "format", "bench", "compare"):
+        assert f"make {command}" in listed
+    missing = subprocess.run(
+        ["make", "install", "PYTHON=no-such-python", "VENV=/tmp/no-such-environment"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert missing.returncode != 0
+    assert "sb3_gcr needs Python 3.10 or newer: 'no-such-python' was not found." in missing.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", "CartPole-v1"], "Parameter `components` must be given for 'CartPole-v1'"),
+        (["--env", "No-v0"], "doesn't exist"),
+        (["--resolver", "best"], "invalid choice: 'best'"),
+        (["--timesteps", "many"], "invalid int value: 'many'"),
+    ],
+)
+def test_train_says_what_is_wrong(arguments: list[str], message: str, tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "examples/train.py"), "--folder", str(tmp_path), *arguments]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not list(tmp_path.iterdir())
