@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ class VectorRolloutBuffer(RolloutBuffer):
     :param n_objectives: number K of reward components
     :param kwargs: the keyword arguments of SB3's ``RolloutBuffer``
     """
+
+    _samples_class: type[Any] = RolloutBufferSamples
 
     def __init__(self, *args: Any, n_objectives: int = 1, **kwargs: Any):
         self.n_objectives = n_objectives
@@ -75,7 +78,7 @@ class VectorRolloutBuffer(RolloutBuffer):
         """
         if not self._tensors:
             self._tensors = {
-                "observations": self._to_samples(self.observations),
+                "observations": _each(self.observations, self._to_samples),
                 "actions": self._to_samples(self.actions.astype(np.float32, copy=False)),
                 "old_values": self._to_samples(self.values),
                 "old_log_prob": self._to_samples(self.log_probs).flatten(),
@@ -85,11 +88,11 @@ class VectorRolloutBuffer(RolloutBuffer):
         n_samples = self.buffer_size * self.n_envs
         # NumPy's global generator and one permutation a pass, as in SB3: the minibatches are PPO's.
         indices = th.from_numpy(np.random.permutation(n_samples)).to(self.device)
-        for batch in indices.split(batch_size or n_samples):
-            yield self._get_samples(batch)
-
-    def _get_samples(self, batch_inds: Any, env: Any = None) -> Any:
-        return RolloutBufferSamples(**{name: tensor[batch_inds] for name, tensor in self._tensors.items()})
+        shuffled = {name: _each(tensor, itemgetter(indices)) for name, tensor in self._tensors.items()}
+        batch_size = batch_size or n_samples
+        for start in range(0, n_samples, batch_size):
+            batch = itemgetter(slice(start, start + batch_size))
+            yield self._samples_class(**{name: _each(tensor, batch) for name, tensor in shuffled.items()})
 
     def _to_samples(self, array: Any) -> Any:
         return self.to_torch(self.swap_and_flatten(array), copy=False)
@@ -98,12 +101,9 @@ class VectorRolloutBuffer(RolloutBuffer):
 class VectorDictRolloutBuffer(VectorRolloutBuffer, DictRolloutBuffer):
     """:class:`VectorRolloutBuffer` for dictionary observations."""
 
-    def _get_samples(self, batch_inds: Any, env: Any = None) -> Any:
-        samples = {name: tensor[batch_inds] for name, tensor in self._tensors.items() if name != "observations"}
-        observations = {key: tensor[batch_inds] for key, tensor in self._tensors["observations"].items()}
-        return DictRolloutBufferSamples(observations=observations, **samples)
+    _samples_class = DictRolloutBufferSamples
 
-    def _to_samples(self, array: Any) -> Any:
-        if isinstance(array, dict):
-            return {key: super(VectorDictRolloutBuffer, self)._to_samples(value) for key, value in array.items()}
-        return super()._to_samples(array)
+
+def _each(value: Any, function: Callable[[Any], Any]) -> Any:
+    """Apply a function to an array, or to every array of a dictionary."""
+    return {key: function(part) for key, part in value.items()} if isinstance(value, dict) else function(value)

@@ -19,13 +19,7 @@ from stable_baselines3.common.utils import explained_variance, update_learning_r
 from sb3_gcr.advantages import joint_scale, normalize_jointly
 from sb3_gcr.components import GYMNASIUM_ENVS, RewardDecomposition
 from sb3_gcr.diagnostics import MinibatchStatistics, append_cosines, cosine_figure, mean_cosines, summarise
-from sb3_gcr.gradients import (
-    ManyBackwards,
-    clipped_surrogates,
-    kl_and_clip_fraction,
-    surrogate_cotangents,
-    value_errors,
-)
+from sb3_gcr.gradients import ManyBackwards, evaluate_surrogates, value_errors
 from sb3_gcr.one_backward import OneBackward
 from sb3_gcr.resolvers import Resolver, bind_resolver
 from sb3_gcr.schedules import adapt_learning_rate
@@ -177,6 +171,7 @@ class GCRPPO(VectorPPO):
             self._weigh(np.eye(self.n_objectives), np.random.default_rng(0))
         return super()._setup_learn(*args, **kwargs)
 
+    @th.no_grad()
     def train(self) -> None:
         """Update the policy from the current rollout: the paper's method, minibatch by minibatch.
 
@@ -184,7 +179,8 @@ class GCRPPO(VectorPPO):
         """
         self._check_rollout_is_finite()
         if self._is_plain_ppo:
-            super().train()
+            with th.enable_grad():
+                super().train()
             return
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
@@ -247,29 +243,24 @@ class GCRPPO(VectorPPO):
         """One optimiser step; returns the minibatch's figures and whether ``target_kl`` lets training go on."""
         actions = batch.actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else batch.actions
         networks = self._networks.evaluate(batch.observations, actions)
-        with th.no_grad():
-            advantages, kappa = batch.advantages, th.ones(())
-            if self._scope == "minibatch":
-                kappa = th.as_tensor(joint_scale(advantages, kappa_max=self.kappa_max))
-                advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
-            surrogate = (networks.log_prob, batch.old_log_prob, advantages, clip_range)
-            cotangents = surrogate_cotangents(*surrogate)
-            value_losses, value_cotangents = value_errors(networks.values, batch.old_values, batch.returns, clip_range_vf)
-            losses = th.cat([clipped_surrogates(*surrogate), value_losses])
-        gramian = networks.gramian(cotangents, self.gramian_samples)
-        with th.no_grad():
-            kl, clip_fraction = kl_and_clip_fraction(networks.log_prob, batch.old_log_prob, clip_range)
-            scalars = th.stack([networks.entropy_loss(), clip_fraction, kl, kappa.to(kl.device)])
-            host = th.cat([gramian.flatten(), losses, scalars]).cpu().double().numpy()
+        advantages, kappa = batch.advantages, 1.0
+        if self._scope == "minibatch":
+            kappa = joint_scale(advantages, kappa_max=self.kappa_max)
+            advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
+        surrogates = evaluate_surrogates(networks.log_prob, batch.old_log_prob, advantages, clip_range)
+        value_losses, value_cotangents = value_errors(networks.values, batch.old_values, batch.returns, clip_range_vf)
+        gramian = networks.gramian(surrogates.cotangents, self.gramian_samples)
+        scalars = th.stack([networks.entropy_loss(), surrogates.clip_fraction, surrogates.kl, th.as_tensor(kappa).to(gramian)])
+        host = th.cat([gramian.flatten(), surrogates.losses, value_losses, scalars]).cpu().double().numpy()
         statistics = self._resolve_minibatch(host)
         if self.target_kl is not None and statistics.approx_kl > 1.5 * self.target_kl:
             self.logger.info(f"Early stopping due to reaching max kl: {statistics.approx_kl:.2f}")
             return statistics, False
         if self.desired_kl is not None and not is_first:  # before the first step the KL divergence is 0 and says nothing
             self._set_learning_rate(adapt_learning_rate(self._learning_rate, statistics.approx_kl, self.desired_kl))
-        weights = th.as_tensor(statistics.weights, dtype=cotangents.dtype, device=cotangents.device)
-        networks.backward(cotangents @ weights, self.vf_coef * value_cotangents, self.ent_coef)
-        norm = networks.clip_gradients(self.max_grad_norm).item()
+        weights = th.as_tensor(statistics.weights).to(gramian)
+        networks.backward(surrogates.cotangents @ weights, self.vf_coef * value_cotangents, self.ent_coef)
+        norm = networks.clip_gradients(self.max_grad_norm)
         if not np.isfinite(norm):
             raise ValueError(self._not_finite_message("gradient norm", norm))
         self.policy.optimizer.step()

@@ -7,9 +7,18 @@ c^(k) is all that distinguishes it. The step of any weights w is one backward pa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
+
+
+class Surrogates(NamedTuple):
+    """The K clipped surrogate losses of a minibatch and what follows from the same ratios."""
+
+    losses: th.Tensor  # (K,)
+    cotangents: th.Tensor  # (B, K)
+    kl: th.Tensor  # ()
+    clip_fraction: th.Tensor  # ()
 
 
 def clipped_surrogates(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
@@ -23,28 +32,33 @@ def clipped_surrogates(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages:
     :param clip_range: ε
     :return: losses, shape (K,)
     """
-    unclipped, clipped = _surrogates(log_prob, old_log_prob, advantages, clip_range)
-    return -th.min(unclipped, clipped).mean(0)
+    return evaluate_surrogates(log_prob, old_log_prob, advantages, clip_range).losses
 
 
-def surrogate_cotangents(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
-    """Derivative of :func:`clipped_surrogates` by log π: c_b^(k) = ∂L^(k)/∂log π_b = -ρ_b Â_b^(k) / B, or 0 where clipped.
+def evaluate_surrogates(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> Surrogates:
+    r"""The losses of :func:`clipped_surrogates` with their derivatives by log π in closed form.
 
-    :param log_prob: shape (B,)
+    .. math:: c_b^{(k)} = \frac{∂L^{(k)}}{∂\log π_b} = -\frac{ρ_b Â_b^{(k)}}{B} \text{ where not clipped, else } 0, \qquad
+        KL ≈ \frac{1}{B} \sum_b (ρ_b - 1) - \log ρ_b
+
+    :param log_prob: log π(a_b|s_b), shape (B,)
     :param old_log_prob: shape (B,)
     :param advantages: Â, shape (B, K)
     :param clip_range: ε
-    :return: c, shape (B, K)
+    :return: losses L, cotangents c, KL(old ‖ current), and the share of samples with abs(ρ - 1) > ε, both as in SB3's PPO
     """
-    unclipped, clipped = _surrogates(log_prob, old_log_prob, advantages, clip_range)
-    return th.where(unclipped <= clipped, unclipped, 0.0) / -len(advantages)
-
-
-def _surrogates(
-    log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float
-) -> tuple[th.Tensor, th.Tensor]:
-    ratio = th.exp(log_prob - old_log_prob).unsqueeze(1)
-    return ratio * advantages, ratio.clamp(1 - clip_range, 1 + clip_range) * advantages
+    log_ratio = log_prob - old_log_prob
+    ratio = log_ratio.exp()
+    column = ratio.unsqueeze(1)
+    unclipped = column * advantages
+    clipped = column.clamp(1 - clip_range, 1 + clip_range) * advantages
+    excess = ratio - 1
+    return Surrogates(
+        losses=-th.min(unclipped, clipped).mean(0),
+        cotangents=th.where(unclipped <= clipped, unclipped, 0.0) / -len(advantages),
+        kl=(excess - log_ratio).mean(),
+        clip_fraction=(excess.abs() > clip_range).to(ratio.dtype).mean(),
+    )
 
 
 def value_errors(
@@ -91,19 +105,6 @@ def gramian_by_passes(log_prob: th.Tensor, cotangents: th.Tensor, parameters: Se
     return jacobian @ jacobian.T
 
 
-def kl_and_clip_fraction(log_prob: th.Tensor, old_log_prob: th.Tensor, clip_range: float) -> tuple[th.Tensor, th.Tensor]:
-    """KL(old ‖ current) by the estimator mean((ρ - 1) - log ρ), and the share of samples with abs(ρ - 1) > ε.
-
-    :param log_prob: shape (B,)
-    :param old_log_prob: shape (B,)
-    :param clip_range: ε
-    :return: two numbers, as in SB3's PPO
-    """
-    log_ratio = log_prob - old_log_prob
-    excess = th.exp(log_ratio) - 1
-    return (excess - log_ratio).mean(), (excess.abs() > clip_range).float().mean()
-
-
 class ManyBackwards:
     """An actor-critic of any kind, evaluated with SB3's ``evaluate_actions`` and differentiated with K + 1 backward passes.
 
@@ -118,7 +119,10 @@ class ManyBackwards:
 
     def evaluate(self, observations: Any, actions: th.Tensor) -> ManyBackwards:
         """Forward pass of actor and critic; sets ``values`` (B, K) and ``log_prob`` (B,)."""
-        self.values, self.log_prob, self._entropy = self.policy.evaluate_actions(observations, actions)
+        with th.enable_grad():
+            self._values, self._log_prob, entropy = self.policy.evaluate_actions(observations, actions)
+            self._entropy_loss = self._log_prob.mean() if entropy is None else -entropy.mean()
+        self.values, self.log_prob = self._values.detach(), self._log_prob.detach()
         return self
 
     def gramian(self, cotangents: th.Tensor, n_samples: int | None = None) -> th.Tensor:
@@ -130,11 +134,11 @@ class ManyBackwards:
         if n_samples is not None:
             cotangents = cotangents.clone()
             cotangents[n_samples:] = 0
-        return gramian_by_passes(self.log_prob, cotangents, self._parameters)
+        return gramian_by_passes(self._log_prob, cotangents, self._parameters)
 
     def entropy_loss(self) -> th.Tensor:
         """PPO's entropy loss: minus the mean entropy, or the mean log π where the entropy has no closed form."""
-        return self.log_prob.mean() if self._entropy is None else -self._entropy.mean()
+        return self._entropy_loss.detach()
 
     def backward(self, cotangent: th.Tensor, value_cotangents: th.Tensor, ent_coef: float) -> None:
         """Set the gradient of the whole loss; frees the graph.
@@ -145,13 +149,13 @@ class ManyBackwards:
         """
         for parameter in self._parameters:
             parameter.grad = None
-        outputs, cotangents = [self.log_prob, self.values], [cotangent, value_cotangents]
+        outputs, cotangents = [self._log_prob, self._values], [cotangent, value_cotangents]
         if ent_coef != 0:
-            outputs.append(self.entropy_loss())
-            cotangents.append(th.full_like(outputs[-1], ent_coef))
+            outputs.append(self._entropy_loss)
+            cotangents.append(th.full_like(self._entropy_loss, ent_coef))
         pairs = [pair for pair in zip(outputs, cotangents, strict=True) if pair[0].requires_grad]
         th.autograd.backward([output for output, _ in pairs], [gradient for _, gradient in pairs])
 
-    def clip_gradients(self, max_norm: float) -> th.Tensor:
+    def clip_gradients(self, max_norm: float) -> float:
         """Scale all gradients down to a joint norm of at most ``max_norm``; the norm before."""
-        return th.nn.utils.clip_grad_norm_(self._parameters, max_norm)
+        return th.nn.utils.clip_grad_norm_(self._parameters, max_norm).item()

@@ -187,7 +187,7 @@ class LogitsHead:
 
     def signal(self) -> th.Tensor:
         """Return ∂log π/∂logits, shape (B, A)."""
-        return th.autograd.grad(self._log_prob.sum(), self._logits, retain_graph=True)[0]
+        return th.autograd.grad(self._log_prob, self._logits, th.ones_like(self._log_prob), retain_graph=True)[0]
 
     def score(self, n_samples: int | None = None) -> None:
         """There is no parameter beside the logits."""
@@ -208,7 +208,7 @@ class LogitsHead:
 class OneBackward:
     """An actor-critic of linear layers, evaluated and differentiated by hand: what ``Evaluation`` does, at PPO's price.
 
-    Call :meth:`evaluate` with a minibatch, then :meth:`gramian` and :meth:`backward`.
+    Under ``torch.no_grad`` call :meth:`evaluate` with a minibatch, then :meth:`gramian` and :meth:`backward`.
 
     :param policy: must fit, see :meth:`fits`
     """
@@ -247,10 +247,9 @@ class OneBackward:
 
     def evaluate(self, observations: Any, actions: th.Tensor) -> OneBackward:
         """Forward pass of actor and critic; sets ``values`` (B, K) and ``log_prob`` (B,)."""
-        with th.no_grad():
-            features = BasePolicy.extract_features(self.policy, observations, self.policy.pi_features_extractor)
-            self.values = self.critic.forward(features)
-            self.log_prob = self.head.forward(self.actor.forward(features), actions)
+        features = BasePolicy.extract_features(self.policy, observations, self.policy.pi_features_extractor)
+        self.values = self.critic.forward(features)
+        self.log_prob = self.head.forward(self.actor.forward(features), actions)
         return self
 
     def gramian(self, cotangents: th.Tensor, n_samples: int | None = None) -> th.Tensor:
@@ -260,16 +259,16 @@ class OneBackward:
         :param n_samples: take the first n rows of the minibatch instead of all; they are in random order already
         """
         self._signals = self.actor.signals(self.head.signal())
-        with th.no_grad():
-            signals = [signal[:n_samples] for signal in self._signals]
-            inputs = [features[:n_samples] for features in self.actor.inputs]
-            return layer_gramian(signals, inputs, self.head.score(n_samples), cotangents[:n_samples])
+        if n_samples is None:
+            return layer_gramian(self._signals, self.actor.inputs, self.head.score(), cotangents)
+        signals = [signal[:n_samples] for signal in self._signals]
+        inputs = [features[:n_samples] for features in self.actor.inputs]
+        return layer_gramian(signals, inputs, self.head.score(n_samples), cotangents[:n_samples])
 
     def entropy_loss(self) -> th.Tensor:
         """PPO's entropy loss: minus the mean entropy."""
         return self.head.entropy_loss()
 
-    @th.no_grad()
     def backward(self, cotangent: th.Tensor, value_cotangents: th.Tensor, ent_coef: float) -> None:
         """Set the gradient of the whole loss; call :meth:`gramian` before.
 
@@ -289,10 +288,11 @@ class OneBackward:
         self.critic.write_gradients(self.critic.signals(value_cotangents))
         self.head.write_gradients(cotangent, ent_coef)
 
-    def clip_gradients(self, max_norm: float) -> th.Tensor:
+    def clip_gradients(self, max_norm: float) -> float:
         """Scale all gradients down to a joint norm of at most ``max_norm``, as ``clip_grad_norm_``; the norm before."""
-        norm = self._flat.norm()
-        self._flat.mul_((max_norm / (norm + 1e-6)).clamp(max=1.0))
+        norm = self._flat.norm().item()
+        if norm > max_norm:
+            self._flat.mul_(max_norm / (norm + 1e-6))
         return norm
 
 

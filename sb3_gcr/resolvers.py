@@ -78,22 +78,24 @@ def gcr(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
     :param rng: draws the order inside a level
     :return: weights w ≥ 1, shape (K,)
     """
-    weights = np.ones(len(gramian))
-    squared_norms = np.diag(gramian)
-    yields = (levels[:, None] >= levels) & ~np.eye(len(levels), dtype=bool)
-    yields &= squared_norms > ZERO_ROW * squared_norms.max(initial=0.0)
-    clash = -TOLERANCE * np.sqrt(np.outer(squared_norms, squared_norms))
-    rows = np.flatnonzero((yields & (gramian < clash)).any(1))
-    if rows.size == 0:
-        return weights
-    inner = gramian[rows]  # ⟨g_i', g_j⟩
-    each = np.arange(rows.size)
-    for met in visiting_order(levels, rng)[rows].T:
-        projects = yields[rows, met] & (inner[each, met] < clash[rows, met])
-        step = np.where(projects, -inner[each, met], 0.0) / np.where(projects, squared_norms[met], 1.0)
-        inner += step[:, None] * gramian[met]
-        np.add.at(weights, met, step)
-    return weights
+    squared_norms = gramian.diagonal()
+    norms = np.sqrt(squared_norms)
+    clash = -TOLERANCE * norms[:, None] * norms
+    yields = (levels[:, None] >= levels) & (squared_norms > ZERO_ROW * squared_norms.max(initial=0.0))
+    np.fill_diagonal(yields, False)
+    fighters = (yields & (gramian < clash)).any(1).nonzero()[0]
+    weights = [1.0] * len(gramian)
+    if fighters.size:
+        # Plain numbers: K is small, and an array operation costs more than a loop over one row.
+        order, rows, limits = visiting_order(levels, rng).tolist(), gramian.tolist(), clash.tolist()
+        for i in fighters.tolist():
+            inner, may_yield = rows[i], yields[i].tolist()  # ⟨g_i', g_j⟩
+            for j in order[i]:
+                if inner[j] < limits[i][j] and may_yield[j]:
+                    step = -inner[j] / rows[j][j]
+                    weights[j] += step
+                    inner = [mine + step * its for mine, its in zip(inner, rows[j], strict=True)]
+    return np.array(weights)
 
 
 def no_priority(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
