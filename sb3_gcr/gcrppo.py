@@ -169,7 +169,11 @@ class GCRPPO(VectorPPO):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if not self._is_plain_ppo:  # a wrong resolver fails before the first rollout
             self._weigh(np.eye(self.n_objectives), np.random.default_rng(0))
-        return super()._setup_learn(*args, **kwargs)
+        result = super()._setup_learn(*args, **kwargs)
+        if not self._is_plain_ppo:
+            way = "one backward pass" if isinstance(self._choose_networks(), OneBackward) else "K backward passes"
+            self.logger.info(f"Gradients of the components: {way}")
+        return result
 
     @th.no_grad()
     def train(self) -> None:

@@ -657,3 +657,6 @@ def test_verbose_says_what_runs(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert "3 reward components: go (task), stay (task), save (regulariser)" in out
     assert "| go        | task        |" in out
+    assert "Gradients of the components: one backward pass" in out
+    GCRPPO("MlpPolicy", make_vec_env(Env, 1), verbose=1, use_sde=True, **SMALL).learn(32)
+    assert "Gradients of the components: K backward passes" in capsys.readouterr().out
