@@ -96,6 +96,7 @@ class GCRPPO(VectorPPO):
         self.gramian_samples = gramian_samples
         self._resolver_rng: np.random.Generator | None = None
         self._adaptive_learning_rate: float | None = None
+        self._n_rollouts_learned = 0
         if isinstance(env, str) and env in GYMNASIUM_ENVS:
             env = RewardDecomposition(maybe_make_env(env, verbose))  # type: ignore[arg-type]
         super().__init__(
@@ -205,6 +206,7 @@ class GCRPPO(VectorPPO):
             self._n_updates += 1
             if not continue_training:
                 break
+        self._n_rollouts_learned += 1
         self._log_update(minibatches, clip_range, clip_range_vf)
 
     def _choose_networks(self) -> OneBackward | ManyBackwards:
@@ -346,8 +348,9 @@ class GCRPPO(VectorPPO):
         if self.n_objectives == 1 or folder is None:
             return
         append_cosines(folder, self.reward_spec, self.num_timesteps, matrix)
-        updates = self._n_updates // self.n_epochs
-        if updates % FIGURE_INTERVAL == 1 and any(isinstance(f, TensorBoardOutputFormat) for f in self.logger.output_formats):
+        if self._n_rollouts_learned % FIGURE_INTERVAL == 1 and any(
+            isinstance(f, TensorBoardOutputFormat) for f in self.logger.output_formats
+        ):
             figure = Figure(cosine_figure(self.reward_spec, {f"{self.num_timesteps} steps": matrix}), close=False)
             self.logger.record("gcr/cosines", figure, exclude=("stdout", "log", "json", "csv"))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
 from typing import Any
@@ -205,6 +206,27 @@ def test_every_resolver_and_a_users_own() -> None:
         learned(GCRPPO("MlpPolicy", make_vec_env(Env, 2), resolver=resolver, **SMALL))
     model = learned(GCRPPO("MlpPolicy", make_vec_env(Env, 2), resolver=mine, resolver_kwargs={"factor": 2.0}, **SMALL))
     assert model.logger.name_to_value["gcr/weight/go"] == 2
+
+
+def test_the_signature_begins_with_ppos() -> None:
+    theirs = list(inspect.signature(PPO.__init__).parameters.values())
+    ours = list(inspect.signature(GCRPPO.__init__).parameters.values())
+    assert [(p.name, p.default) for p in ours[: len(theirs)]] == [(p.name, p.default) for p in theirs]
+    assert all(p.default is not inspect.Parameter.empty for p in ours[len(theirs) :])
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "scale"),
+    [({"normalize_advantage": False}, "none"), ({"advantage_scope": "minibatch"}, "minibatch"), ({}, "rollout")],
+)
+def test_scope_of_the_normalisation(kwargs: Any, scale: str) -> None:
+    model = GCRPPO("MlpPolicy", make_vec_env(Env, 2, seed=0), **SMALL, **kwargs).learn(64)
+    total = model.rollout_buffer.advantages.sum(-1)
+    assert bool(abs(total.std(ddof=1) - 1) < 1e-4) is (scale == "rollout")
+    kappa = model.logger.name_to_value["gcr/kappa"]
+    assert bool(kappa == 1) is (scale == "none")
+    if scale == "minibatch":
+        assert kappa == pytest.approx(1 / total.std(ddof=1), rel=0.3)
 
 
 def test_seed_decides_everything() -> None:
