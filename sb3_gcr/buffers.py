@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
+from functools import partial
 from operator import itemgetter
 from typing import Any
 
@@ -33,6 +34,7 @@ class VectorRolloutBuffer(RolloutBuffer):
         """Empty the buffer."""
         super().reset()
         self._tensors: dict[str, Any] = {}
+        self._shuffled: dict[str, Any] = {}
         for name in ("rewards", "values", "advantages", "returns"):
             setattr(self, name, np.zeros((self.buffer_size, self.n_envs, self.n_objectives), dtype=np.float32))
 
@@ -72,7 +74,8 @@ class VectorRolloutBuffer(RolloutBuffer):
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
         """Yield the rollout in random minibatches; ``old_values``, ``advantages`` and ``returns`` have shape (B, K).
 
-        The arrays become tensors on the device once per rollout; changes made to them after the first call are not seen.
+        The arrays become tensors on the device once per rollout; changes made to them after the first call are not seen. The
+        minibatches of one call share memory with those of the next.
 
         :param batch_size: size B of a minibatch; None is the whole rollout
         """
@@ -88,11 +91,14 @@ class VectorRolloutBuffer(RolloutBuffer):
         n_samples = self.buffer_size * self.n_envs
         # NumPy's global generator and one permutation a pass, as in SB3: the minibatches are PPO's.
         indices = th.from_numpy(np.random.permutation(n_samples)).to(self.device)
-        shuffled = {name: _each(tensor, itemgetter(indices)) for name, tensor in self._tensors.items()}
+        if not self._shuffled:
+            self._shuffled = {name: _each(tensor, th.empty_like) for name, tensor in self._tensors.items()}
+        for name, tensor in self._tensors.items():
+            _each(tensor, partial(_gather, indices), self._shuffled[name])
         batch_size = batch_size or n_samples
         for start in range(0, n_samples, batch_size):
             batch = itemgetter(slice(start, start + batch_size))
-            yield self._samples_class(**{name: _each(tensor, batch) for name, tensor in shuffled.items()})
+            yield self._samples_class(**{name: _each(tensor, batch) for name, tensor in self._shuffled.items()})
 
     def _to_samples(self, array: Any) -> Any:
         return self.to_torch(self.swap_and_flatten(array), copy=False)
@@ -104,6 +110,13 @@ class VectorDictRolloutBuffer(VectorRolloutBuffer, DictRolloutBuffer):
     _samples_class = DictRolloutBufferSamples
 
 
-def _each(value: Any, function: Callable[[Any], Any]) -> Any:
+def _gather(indices: th.Tensor, source: th.Tensor, target: th.Tensor) -> None:
+    """Copy rows into memory that is there already: new memory would cost more than the copy."""
+    th.index_select(source, 0, indices, out=target)
+
+
+def _each(value: Any, function: Callable[..., Any], *others: Any) -> Any:
     """Apply a function to an array, or to every array of a dictionary."""
-    return {key: function(part) for key, part in value.items()} if isinstance(value, dict) else function(value)
+    if isinstance(value, dict):
+        return {key: function(part, *(other[key] for other in others)) for key, part in value.items()}
+    return function(value, *others)

@@ -249,15 +249,16 @@ class GCRPPO(VectorPPO):
         """One optimiser step; returns the minibatch's figures and whether ``target_kl`` lets training go on."""
         actions = batch.actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else batch.actions
         networks = self._networks.evaluate(batch.observations, actions)
-        advantages, kappa = batch.advantages, 1.0
+        advantages, kappa = batch.advantages, None
         if self._scope == "minibatch":
-            kappa = joint_scale(advantages, kappa_max=self.kappa_max)
+            kappa = th.as_tensor(joint_scale(advantages, kappa_max=self.kappa_max), device=advantages.device)
             advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
         surrogates = evaluate_surrogates(networks.log_prob, batch.old_log_prob, advantages, clip_range)
         value_losses, value_cotangents = value_errors(networks.values, batch.old_values, batch.returns, clip_range_vf)
         gramian = networks.gramian(surrogates.cotangents, self.gramian_samples)
-        scalars = th.stack([networks.entropy_loss(), surrogates.clip_fraction, surrogates.kl, th.as_tensor(kappa).to(gramian)])
-        host = th.cat([gramian.flatten(), surrogates.losses, value_losses, scalars]).cpu().double().numpy()
+        kappa = th.ones_like(surrogates.kl) if kappa is None else kappa
+        scalars = th.stack([networks.entropy_loss(), surrogates.clip_fraction, surrogates.kl, kappa])
+        host = th.cat([gramian.flatten(), surrogates.losses, value_losses, scalars]).cpu().numpy().astype(float)
         statistics = self._resolve_minibatch(host)
         if self.target_kl is not None and statistics.approx_kl > 1.5 * self.target_kl:
             self.logger.info(f"Early stopping due to reaching max kl: {statistics.approx_kl:.2f}")

@@ -28,8 +28,10 @@ from torch import nn
 
 #: Numbers that a block of K weight gradients may hold at a time, on the CPU and on other devices.
 BLOCK, BLOCK_ON_DEVICE = 2**22, 2**26
-#: Minibatches up to this size get M in one piece, larger ones by rows of half of it.
-WHOLE = 512
+#: Minibatches up to this size get M in one piece; of larger ones only the upper half, by blocks of rows of these heights.
+WHOLE, LOWEST, HIGHEST = 128, 64, 256
+#: Operations on the elements of M count like so many columns of Δ and H.
+ELEMENTWISE = 30
 _aten = th.ops.aten
 _LOG_2PI = float(np.log(2 * np.pi))
 
@@ -309,7 +311,8 @@ def layer_gramian(
     """
     n_samples, n_objectives = cotangents.shape
     by_samples = [
-        n_samples * (signal.shape[1] + features.shape[1]) <= 2 * n_objectives * signal.shape[1] * features.shape[1]
+        0.6 * n_samples * (signal.shape[1] + features.shape[1] + ELEMENTWISE)
+        <= n_objectives * signal.shape[1] * features.shape[1]
         for signal, features in zip(signals, inputs, strict=True)
     ]
     pairs = list(zip(signals, inputs, strict=True))
@@ -327,7 +330,7 @@ def _gramian_by_samples(
     one = cotangents.new_ones(1, 1)
     gramian = cotangents.new_zeros(cotangents.shape[1], cotangents.shape[1])
     n_samples = len(cotangents)
-    height = n_samples if n_samples <= WHOLE else WHOLE // 2
+    height = n_samples if n_samples <= WHOLE else min(HIGHEST, max(LOWEST, n_samples // 4))
     for start in range(0, n_samples, height):
         rows, columns = slice(start, start + height), slice(start, n_samples)
         block = None if score is None else th.mm(score[rows], score[columns].T)

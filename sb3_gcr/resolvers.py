@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -78,23 +79,22 @@ def gcr(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
     :param rng: draws the order inside a level
     :return: weights w ≥ 1, shape (K,)
     """
-    squared_norms = gramian.diagonal()
-    norms = np.sqrt(squared_norms)
-    clash = -TOLERANCE * norms[:, None] * norms
-    yields = (levels[:, None] >= levels) & (squared_norms > ZERO_ROW * squared_norms.max(initial=0.0))
-    np.fill_diagonal(yields, False)
-    fighters = (yields & (gramian < clash)).any(1).nonzero()[0]
-    weights = [1.0] * len(gramian)
-    if fighters.size:
-        # Plain numbers: K is small, and an array operation costs more than a loop over one row.
-        order, rows, limits = visiting_order(levels, rng).tolist(), gramian.tolist(), clash.tolist()
-        for i in fighters.tolist():
-            inner, may_yield = rows[i], yields[i].tolist()  # ⟨g_i', g_j⟩
-            for j in order[i]:
-                if inner[j] < limits[i][j] and may_yield[j]:
-                    step = -inner[j] / rows[j][j]
-                    weights[j] += step
-                    inner = [mine + step * its for mine, its in zip(inner, rows[j], strict=True)]
+    # Plain numbers: K is small, and one array operation costs more than a loop over a row.
+    rows, ranks = gramian.tolist(), levels.tolist()
+    norms = [math.sqrt(row[i]) for i, row in enumerate(rows)]
+    vanishing = math.sqrt(ZERO_ROW) * max(norms)
+    weights, order = [1.0] * len(rows), None
+    for i, inner in enumerate(rows):
+        limit = -TOLERANCE * norms[i]
+        if not any(inner[j] < limit * norms[j] and ranks[j] <= ranks[i] for j in range(len(rows))):
+            continue
+        if order is None:
+            order = visiting_order(levels, rng).tolist()
+        for j in order[i]:  # inner[j] = ⟨g_i', g_j⟩
+            if inner[j] < limit * norms[j] and ranks[j] <= ranks[i] and j != i and norms[j] > vanishing:
+                step = -inner[j] / rows[j][j]
+                weights[j] += step
+                inner = [mine + step * its for mine, its in zip(inner, rows[j], strict=True)]
     return np.array(weights)
 
 
