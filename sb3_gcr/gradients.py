@@ -78,11 +78,11 @@ def value_errors(
     """
     if clip_range_vf is None:
         error = values - returns
-        return (error**2).mean(0), error * (2 / len(values))
+        return (error * error).mean(0), error * (2 / len(values))
     change = values - old_values
     error = old_values + change.clamp(-clip_range_vf, clip_range_vf) - returns
     free = change.abs() <= clip_range_vf
-    return (error**2).mean(0), th.where(free, error, 0.0) * (2 / len(values))
+    return (error * error).mean(0), th.where(free, error, 0.0) * (2 / len(values))
 
 
 def gramian_by_passes(log_prob: th.Tensor, cotangents: th.Tensor, parameters: Sequence[th.nn.Parameter]) -> th.Tensor:

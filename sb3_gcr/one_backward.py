@@ -12,10 +12,13 @@ small networks most of the time of an update is PyTorch's bookkeeping, not arith
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.distributions import (
     BernoulliDistribution,
     CategoricalDistribution,
@@ -65,26 +68,28 @@ class Activation:
     """
 
     def __init__(self, module: nn.Module):
-        self.module = module
+        # The functions themselves: a call of a module costs as much as the arithmetic of a small layer.
+        self.forward: Callable[[th.Tensor], th.Tensor] = module.forward
+        if isinstance(module, nn.Tanh):
+            self.forward, self.backward = th.tanh, _aten.tanh_backward.default
+        elif isinstance(module, nn.ReLU):
+            self.forward, self.backward = th.relu, partial(_aten.threshold_backward.default, threshold=0)
+        elif isinstance(module, nn.ELU):
+            alpha = module.alpha
+            self.backward = lambda signal, output: _aten.elu_backward.default(signal, alpha, 1, 1, True, output)
+        else:
+            self.forward, self.backward = partial(self._forward_with_graph, module), self._backward_through_graph
 
-    def forward(self, preactivation: th.Tensor) -> th.Tensor:
-        """Output of shape (B, out)."""
-        if isinstance(self.module, nn.Tanh | nn.ReLU | nn.ELU):
-            self._output: th.Tensor = self.module(preactivation)
-            return self._output
+    #: Signal in front of the activation, from the one behind it and the activation's output.
+    backward: Callable[[th.Tensor, th.Tensor], th.Tensor]
+
+    def _forward_with_graph(self, module: nn.Module, preactivation: th.Tensor) -> th.Tensor:
         with th.enable_grad():
             self._input = preactivation.detach().requires_grad_()
-            self._output = self.module(self._input)
+            self._output = module(self._input)
         return self._output.detach()
 
-    def backward(self, signal: th.Tensor) -> th.Tensor:
-        """Signal in front of the activation from the one behind it."""
-        if isinstance(self.module, nn.Tanh):
-            return _aten.tanh_backward(signal, self._output)
-        if isinstance(self.module, nn.ReLU):
-            return _aten.threshold_backward(signal, self._output, 0)
-        if isinstance(self.module, nn.ELU):
-            return _aten.elu_backward(signal, self.module.alpha, 1, 1, True, self._output)
+    def _backward_through_graph(self, signal: th.Tensor, output: th.Tensor) -> th.Tensor:
         return th.autograd.grad(self._output, self._input, signal, retain_graph=True)[0]
 
 
@@ -94,8 +99,9 @@ class Mlp:
     :param modules: linear layers and activations in turn, beginning and ending with a linear layer
     """
 
-    def __init__(self, *modules: nn.Module):
-        self.layers: list[Any] = list(modules[::2])
+    def __init__(self, *modules: Any):
+        self.weights = [layer.weight for layer in modules[::2]]
+        self.biases = [layer.bias for layer in modules[::2]]
         self.activations = [Activation(module) for module in modules[1::2]]
 
     @staticmethod
@@ -111,22 +117,22 @@ class Mlp:
     def forward(self, features: th.Tensor) -> th.Tensor:
         """Output for features of shape (B, in); each layer's input H is kept."""
         self.inputs = [features]
-        for layer, activation in zip(self.layers, self.activations, strict=False):
-            self.inputs.append(activation.forward(nn.functional.linear(self.inputs[-1], layer.weight, layer.bias)))
-        return nn.functional.linear(self.inputs[-1], self.layers[-1].weight, self.layers[-1].bias)
+        for weight, bias, activation in zip(self.weights, self.biases, self.activations, strict=False):
+            features = activation.forward(th.addmm(bias, features, weight.T))
+            self.inputs.append(features)
+        return th.addmm(self.biases[-1], features, self.weights[-1].T)
 
     def signals(self, cotangent: th.Tensor) -> list[th.Tensor]:
         """The signal Δ of shape (B, out) at each layer's output, for a cotangent of the last one."""
         signals = [cotangent]
-        for layer, activation in zip(self.layers[:0:-1], self.activations[::-1], strict=True):
-            signals.append(activation.backward(th.mm(signals[-1], layer.weight)))
+        for weight, activation, output in zip(self.weights[:0:-1], self.activations[::-1], self.inputs[:0:-1], strict=True):
+            signals.append(activation.backward(th.mm(signals[-1], weight), output))
         return signals[::-1]
 
-    def write_gradients(self, signals: list[th.Tensor]) -> None:
-        """Set each layer's gradients to Δᵀ H and Δᵀ 1."""
-        for layer, signal, features in zip(self.layers, signals, self.inputs, strict=True):
-            th.mm(signal.T, features, out=layer.weight.grad)
-            th.sum(signal, 0, out=layer.bias.grad)
+    def write_weight_gradients(self, signals: Iterable[th.Tensor]) -> None:
+        """Set the gradient of each layer's weights to Δᵀ H."""
+        for weight, signal, features in zip(self.weights, signals, self.inputs, strict=True):
+            th.mm(signal.T, features, out=weight.grad)
 
 
 class GaussianHead:
@@ -143,6 +149,7 @@ class GaussianHead:
         self._scale = th.exp(-self.log_std)
         self._z = (actions - mean) * self._scale
         self._squares = self._z * self._z
+        self._score = self._squares - 1
         self._log_det = self.log_std.sum() + 0.5 * _LOG_2PI * mean.shape[1]
         return self._squares.sum(1).mul_(-0.5) - self._log_det
 
@@ -152,7 +159,7 @@ class GaussianHead:
 
     def score(self, n_samples: int | None = None) -> th.Tensor:
         """S = ∂log π/∂log σ = ((a - μ) / σ)² - 1 of the first n samples, shape (n, A)."""
-        return self._squares[:n_samples] - 1
+        return self._score[:n_samples]
 
     def entropy_loss(self) -> th.Tensor:
         """Minus the entropy Σ log σ + ½ A (1 + log 2π)."""
@@ -164,7 +171,7 @@ class GaussianHead:
 
     def write_gradients(self, cotangent: th.Tensor, ent_coef: float) -> None:
         """Set the gradient of log σ: Sᵀ c, and -ent_coef from the entropy."""
-        th.mv(self.score().T, cotangent, out=self.log_std.grad)
+        th.mv(self._score.T, cotangent, out=self.log_std.grad)
         if ent_coef != 0:
             self.log_std.grad.sub_(ent_coef)
 
@@ -220,11 +227,18 @@ class OneBackward:
         self.actor, self.critic = Mlp(*_actor_modules(policy)), Mlp(*_critic_modules(policy))
         gaussian = isinstance(policy.action_dist, DiagGaussianDistribution)
         self.head: GaussianHead | LogitsHead = GaussianHead(policy) if gaussian else LogitsHead(policy)
-        self._parameters = list(policy.parameters())
-        # One block of memory for all gradients: their norm and their scaling are then one operation each.
+        biases = [*self.actor.biases, *self.critic.biases]
+        # One block of memory for all gradients, biases first: their norm, their scaling, and the sums over samples that are
+        # the gradients of the biases, are then one operation each.
+        self._parameters = biases + [p for p in policy.parameters() if all(p is not bias for bias in biases)]
         self._flat = th.zeros(sum(parameter.numel() for parameter in self._parameters), device=policy.device)
         pieces = self._flat.split([parameter.numel() for parameter in self._parameters])
-        self._views = [piece.view_as(p) for piece, p in zip(pieces, self._parameters, strict=True)]
+        self._gradients = [piece.view_as(p) for piece, p in zip(pieces, self._parameters, strict=True)]
+        self._bias_gradients = self._flat[: sum(bias.numel() for bias in biases)]
+        self._widths = [bias.numel() for bias in self.actor.biases]
+        extractor, space = policy.pi_features_extractor, policy.observation_space
+        # Vectors pass through SB3's preprocessing and flattening as they are.
+        self._takes_vectors = type(extractor) is FlattenExtractor and isinstance(space, spaces.Box) and len(space.shape) == 1
 
     @staticmethod
     def fits(policy: Any) -> bool:
@@ -249,7 +263,10 @@ class OneBackward:
 
     def evaluate(self, observations: Any, actions: th.Tensor) -> OneBackward:
         """Forward pass of actor and critic; sets ``values`` (B, K) and ``log_prob`` (B,)."""
-        features = BasePolicy.extract_features(self.policy, observations, self.policy.pi_features_extractor)
+        if self._takes_vectors:
+            features = observations.float()
+        else:
+            features = BasePolicy.extract_features(self.policy, observations, self.policy.pi_features_extractor)
         self.values = self.critic.forward(features)
         self.log_prob = self.head.forward(self.actor.forward(features), actions)
         return self
@@ -278,16 +295,19 @@ class OneBackward:
         :param value_cotangents: of the values, shape (B, K)
         :param ent_coef: weight of the entropy loss
         """
-        for parameter, view in zip(self._parameters, self._views, strict=True):
-            parameter.grad = view
+        if self._parameters[0].grad is not self._gradients[0]:
+            for parameter, gradient in zip(self._parameters, self._gradients, strict=True):
+                parameter.grad = gradient
+        column = cotangent.unsqueeze(1)
         entropy_signal = self.head.entropy_signal() if ent_coef != 0 else None
         if entropy_signal is None:
-            column = cotangent.unsqueeze(1)
-            signals = [signal * column for signal in self._signals]
+            actor_signals = th.cat(self._signals, 1) * column
         else:
-            signals = self.actor.signals(self._signals[-1] * cotangent.unsqueeze(1) + ent_coef * entropy_signal)
-        self.actor.write_gradients(signals)
-        self.critic.write_gradients(self.critic.signals(value_cotangents))
+            actor_signals = th.cat(self.actor.signals(self._signals[-1] * column + ent_coef * entropy_signal), 1)
+        critic_signals = self.critic.signals(value_cotangents)
+        self.actor.write_weight_gradients(actor_signals.split_with_sizes(self._widths, 1))
+        self.critic.write_weight_gradients(critic_signals)
+        th.sum(th.cat([actor_signals, *critic_signals], 1), 0, out=self._bias_gradients)
         self.head.write_gradients(cotangent, ent_coef)
 
     def clip_gradients(self, max_norm: float) -> float:
@@ -328,8 +348,8 @@ def _gramian_by_samples(
 ) -> th.Tensor:
     """C M Cᵀ with M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ + 1) + S Sᵀ, by blocks of rows; of the symmetric M only the upper half."""
     one = cotangents.new_ones(1, 1)
-    gramian = cotangents.new_zeros(cotangents.shape[1], cotangents.shape[1])
     n_samples = len(cotangents)
+    gramian: th.Tensor | float = 0.0
     height = n_samples if n_samples <= WHOLE else min(HIGHEST, max(LOWEST, n_samples // 4))
     for start in range(0, n_samples, height):
         rows, columns = slice(start, start + height), slice(start, n_samples)
@@ -339,13 +359,14 @@ def _gramian_by_samples(
             overlaps = th.addmm(one, features[rows], features[columns].T)
             block = products.mul_(overlaps) if block is None else block.addcmul_(products, overlaps)
         if block is None:
-            break
+            return cotangents.new_zeros(cotangents.shape[1], cotangents.shape[1])
         left = cotangents[rows]
         width = len(left)
-        gramian += left.T @ (block[:, :width] @ left)
+        gramian = gramian + left.T @ (block[:, :width] @ left)
         if start + width < n_samples:
             off_diagonal = left.T @ (block[:, width:] @ cotangents[start + width :])
-            gramian += off_diagonal + off_diagonal.T
+            gramian = gramian + off_diagonal + off_diagonal.T
+    assert isinstance(gramian, th.Tensor)
     return gramian
 
 
