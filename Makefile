@@ -47,6 +47,7 @@ format: install  ## format and mend what can be mended
 	@$(BIN)/ruff check --fix .
 
 bench: install  ## measure the update against PPO and others (under 15 minutes)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	@$(BIN)/python -m benchmarks
 
 compare: install  ## the table of the README: GCRPPO and PPO, several seeds

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -80,21 +79,19 @@ def gcr(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
     :return: weights w ≥ 1, shape (K,)
     """
     # Plain numbers: K is small, and one array operation costs more than a loop over a row.
-    rows, ranks = gramian.tolist(), levels.tolist()
-    norms = [math.sqrt(row[i]) for i, row in enumerate(rows)]
-    vanishing = math.sqrt(ZERO_ROW) * max(norms)
+    rows, ranks = cosines(gramian).tolist(), levels.tolist()
+    norms = np.sqrt(gramian.diagonal()).tolist()
     weights, order = [1.0] * len(rows), None
-    for i, inner in enumerate(rows):
-        limit = -TOLERANCE * norms[i]
-        if not any(inner[j] < limit * norms[j] and ranks[j] <= ranks[i] for j in range(len(rows))):
+    for i, inner in enumerate(rows):  # inner[j] = ⟨g_i', g_j⟩ / (|g_i| |g_j|)
+        if min(inner) >= -TOLERANCE:
             continue
         if order is None:
             order = visiting_order(levels, rng).tolist()
-        for j in order[i]:  # inner[j] = ⟨g_i', g_j⟩
-            if inner[j] < limit * norms[j] and ranks[j] <= ranks[i] and j != i and norms[j] > vanishing:
-                step = -inner[j] / rows[j][j]
-                weights[j] += step
-                inner = [mine + step * its for mine, its in zip(inner, rows[j], strict=True)]
+        for j in order[i]:
+            cosine = inner[j]
+            if cosine < -TOLERANCE and ranks[j] <= ranks[i] and j != i:
+                inner = [mine - cosine * its for mine, its in zip(inner, rows[j], strict=True)]
+                weights[j] -= cosine * norms[i] / norms[j]
     return np.array(weights)
 
 
