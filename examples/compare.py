@@ -70,24 +70,33 @@ def interval(values: list[float]) -> str:
     return f"{np.mean(values):.0f} ± {half:.0f}"
 
 
-def table(results: list[dict[str, Any]]) -> str:
-    """One row per method; p values of two-sided Welch tests against PPO on the final return, Holm-corrected."""
-    by_method: dict[str, list[dict[str, Any]]] = {name: [r for r in results if r["method"] == name] for name in METHODS}
-    by_method = {name: rows for name, rows in by_method.items() if rows}
-    finals = {name: [row["final"]["return"] for row in rows] for name, rows in by_method.items()}
-    others = [name for name in finals if name != "PPO" and "PPO" in finals]
-    raw = {name: float(ttest_ind(finals[name], finals["PPO"], equal_var=False).pvalue) for name in others}
+def p_values(samples: dict[str, list[float]]) -> dict[str, str]:
+    """Two-sided Welch tests of every method against PPO, Holm-corrected, as text by method."""
+    raw = {
+        name: float(ttest_ind(values, samples["PPO"], equal_var=False).pvalue)
+        for name, values in samples.items()
+        if name != "PPO" and "PPO" in samples and len(values) > 1
+    }
     corrected: dict[str, float] = {}
     for rank, name in enumerate(sorted(raw, key=lambda key: raw[key])):
         corrected[name] = min(1.0, max([*corrected.values(), raw[name] * (len(raw) - rank)]))
+    return {name: f"{p:.2f}" if p >= 0.01 else "< 0.01" for name, p in corrected.items()}
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """One row per method: return during training and of the final policy with p values against PPO, then the components."""
+    runs = {name: [row for row in results if row["method"] == name] for name in METHODS}
+    runs = {name: rows for name, rows in runs.items() if rows}
+    training = {name: [row["during training"] for row in rows] for name, rows in runs.items()}
+    final = {name: [row["final"]["return"] for row in rows] for name, rows in runs.items()}
+    p_training, p_final = p_values(training), p_values(final)
     components = [key for key in results[0]["final"] if key != "return"]
-    rows = [["method", "seeds", "return in training", "final return", "p", *components]]
-    for name, runs in by_method.items():
-        p = f"{corrected[name]:.2f}" if name in corrected else ""
-        cells = [interval([row["final"][key] for row in runs]) for key in components]
-        training = interval([row["during training"] for row in runs])
-        rows.append([name, str(len(runs)), training, interval(finals[name]), p, *cells])
-    return format_table(rows)
+    lines = [["method", "seeds", "return in training", "p", "final return", "p", *components]]
+    for name, rows in runs.items():
+        cells = [interval(training[name]), p_training.get(name, ""), interval(final[name]), p_final.get(name, "")]
+        cells += [interval([row["final"][key] for row in rows]) for key in components]
+        lines.append([name, str(len(rows)), *cells])
+    return format_table(lines)
 
 
 def main() -> None:
