@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-TIMESTEPS ?= 300000
+TIMESTEPS ?= 250000
 ENV ?= Humanoid-v5
 SEED ?= 0
 RESOLVER ?= gcr

@@ -35,7 +35,7 @@ def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="Humanoid-v5", help="an env whose reward terms are known")
-    parser.add_argument("--timesteps", type=int, default=300_000)
+    parser.add_argument("--timesteps", type=int, default=250_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--resolver", default="gcr", choices=sorted(RESOLVERS))
     parser.add_argument("--folder", type=Path, default=Path("logs"), help="a folder for this run is made in it")

@@ -91,7 +91,7 @@ def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
     assert blocks
     monkeypatch.chdir(tmp_path)
-    code = "\n".join(blocks).replace("300_000", "4_096")
+    code = "\n".join(blocks).replace("250_000", "4_096")
     namespace: dict[str, object] = {}
     exec(compile(code, "README.md", "exec"), namespace)
     namespace["model"].logger.close()  # type: ignore[attr-defined]

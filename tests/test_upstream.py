@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import inspect
-import textwrap
 from typing import Any
 
 import pytest
@@ -18,45 +16,41 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 REVIEWED = {
-    (PPO, "__init__"): "9149f29c4465",
-    (PPO, "_setup_model"): "b63eabb97579",
-    (PPO, "train"): "744e951f0ff6",
-    (PPO, "learn"): "f2d9e9d25b6c",
-    (OnPolicyAlgorithm, "_setup_model"): "f4350385d82e",
-    (OnPolicyAlgorithm, "_maybe_recommend_cpu"): "6eac4f54b045",
-    (OnPolicyAlgorithm, "collect_rollouts"): "ade66a1ce768",
-    (OnPolicyAlgorithm, "dump_logs"): "6b245e0f4d2e",
-    (BaseAlgorithm, "_excluded_save_params"): "82e5c65739ba",
-    (BaseAlgorithm, "_get_policy_from_name"): "3e6820ba3f96",
-    (BaseAlgorithm, "_setup_learn"): "7eed1da120cc",
-    (BaseAlgorithm, "_update_learning_rate"): "f3a9690538a7",
-    (BaseAlgorithm, "load"): "b5180feac421",
-    (BaseAlgorithm, "save"): "63a986b4596f",
-    (BaseAlgorithm, "set_env"): "a5e6da0dc352",
-    (BaseAlgorithm, "set_random_seed"): "bd6c75e74746",
-    (ActorCriticPolicy, "_build"): "1e0564f2a405",
-    (ActorCriticPolicy, "_get_constructor_parameters"): "3c22594e38b8",
-    (ActorCriticPolicy, "_get_action_dist_from_latent"): "7344d5c35282",
-    (ActorCriticPolicy, "evaluate_actions"): "ccf6b1574512",
-    (BasePolicy, "extract_features"): "a43d6d220031",
-    (RolloutBuffer, "reset"): "de8f977b2615",
-    (RolloutBuffer, "add"): "da5ab2c5d3f5",
-    (RolloutBuffer, "get"): "2c1a9e9863ce",
-    (RolloutBuffer, "compute_returns_and_advantage"): "f64be170293e",
-    (DictRolloutBuffer, "add"): "67ccae224fa1",
-    (VecNormalize, "normalize_reward"): "ebd5e333496a",
-    (VecNormalize, "step_wait"): "a8bc18106882",
-    (None, "evaluate_policy"): "a425756913b1",
+    (PPO, "__init__"): "21c5c4ab7fe7",
+    (PPO, "_setup_model"): "165f5575cd97",
+    (PPO, "train"): "7c8d09940123",
+    (PPO, "learn"): "3765df0b88e6",
+    (OnPolicyAlgorithm, "_setup_model"): "1bfc1e2ac80d",
+    (OnPolicyAlgorithm, "_maybe_recommend_cpu"): "059330d480e9",
+    (OnPolicyAlgorithm, "collect_rollouts"): "07f9eed35d9d",
+    (OnPolicyAlgorithm, "dump_logs"): "22e7a7c5dd2a",
+    (BaseAlgorithm, "_excluded_save_params"): "5452fc7cb8c0",
+    (BaseAlgorithm, "_get_policy_from_name"): "4f517fba221d",
+    (BaseAlgorithm, "_setup_learn"): "1c5a903f4b48",
+    (BaseAlgorithm, "_update_learning_rate"): "2c117a53cb3a",
+    (BaseAlgorithm, "load"): "d069b9b05c12",
+    (BaseAlgorithm, "save"): "c7b1113e7105",
+    (BaseAlgorithm, "set_env"): "1fe1a0febcdb",
+    (BaseAlgorithm, "set_random_seed"): "0e7d5cb60fca",
+    (ActorCriticPolicy, "_build"): "262b19d3fff0",
+    (ActorCriticPolicy, "_get_constructor_parameters"): "12e4522b41b0",
+    (ActorCriticPolicy, "_get_action_dist_from_latent"): "96660636deab",
+    (ActorCriticPolicy, "evaluate_actions"): "064f42328253",
+    (BasePolicy, "extract_features"): "302b47463695",
+    (RolloutBuffer, "reset"): "20b4f5d48e0c",
+    (RolloutBuffer, "add"): "624274151cae",
+    (RolloutBuffer, "get"): "7500122932f8",
+    (RolloutBuffer, "compute_returns_and_advantage"): "1a229ef50a03",
+    (DictRolloutBuffer, "add"): "19875423ca87",
+    (VecNormalize, "normalize_reward"): "2fd793eb4439",
+    (VecNormalize, "step_wait"): "9b005da93b70",
+    (None, "evaluate_policy"): "2fba33ab1a6b",
 }
 
 
 def fingerprint(function: Any) -> str:
-    """Hash of a function's code without comments, docstrings and formatting."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef) and ast.get_docstring(node) is not None:
-            node.body = node.body[1:]
-    return hashlib.sha256(ast.unparse(tree).encode()).hexdigest()[:12]
+    """Hash of a function's source."""
+    return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()[:12]
 
 
 @pytest.mark.parametrize(("owner", "name"), list(REVIEWED), ids=lambda value: getattr(value, "__name__", str(value)))
