@@ -146,7 +146,8 @@ class GCRPPO(VectorPPO):
             raise ValueError(
                 f"Parameter `gramian_method` must be 'auto', 'one_backward' or 'passes', found {self.gramian_method!r}."
             )
-        if self.gramian_samples is not None and not self.gramian_samples > 0:
+        samples = self.gramian_samples
+        if samples is not None and not (isinstance(samples, int | np.integer) and samples > 0):
             raise ValueError(f"Parameter `gramian_samples` must be an integer > 0 or None, found {self.gramian_samples!r}.")
         if self.desired_kl is not None and not self.desired_kl > 0:
             raise ValueError(f"Parameter `desired_kl` must be a number > 0 or None, found {self.desired_kl!r}.")

@@ -23,6 +23,8 @@ Resolver = Callable[[Array, Levels, np.random.Generator], Array]
 
 #: Two gradients conflict when ⟨g_i, g_j⟩ is below minus this share of |g_i| |g_j|: rounding is no conflict.
 TOLERANCE = 1e-12
+#: Up to so many components the projections run row by row.
+FEW = 14
 #: A component whose squared gradient norm is below this share of the largest one has no gradient.
 ZERO_ROW = 1e-40
 #: Eigenvalues of a Gramian of unit gradients below this share of the largest are rounding.
@@ -78,21 +80,41 @@ def gcr(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
     :param rng: draws the order inside a level
     :return: weights w ≥ 1, shape (K,)
     """
-    # Plain numbers: K is small, and one array operation costs more than a loop over a row.
-    rows, ranks = cosines(gramian).tolist(), levels.tolist()
-    norms = np.sqrt(gramian.diagonal()).tolist()
-    weights, order = [1.0] * len(rows), None
-    for i, inner in enumerate(rows):  # inner[j] = ⟨g_i', g_j⟩ / (|g_i| |g_j|)
+    directions = cosines(gramian)
+    if not (directions < -TOLERANCE).any():
+        return np.ones(len(gramian))
+    norms = np.sqrt(gramian.diagonal())
+    # For few components one array operation costs more than a loop over a row; the two take the same steps.
+    project = _project_row_by_row if len(gramian) <= FEW else _project_rows_together
+    return project(directions, norms, levels, visiting_order(levels, rng))
+
+
+def _project_row_by_row(directions: Array, norms: Array, levels: Levels, order: NDArray[np.intp]) -> Array:
+    """Weights of :func:`gcr` in plain numbers; ``directions`` are the cosines, ``order`` says whom each component meets."""
+    rows, sizes, ranks = directions.tolist(), norms.tolist(), levels.tolist()
+    weights = [1.0] * len(rows)
+    for i, (inner, met) in enumerate(zip(rows, order.tolist(), strict=True)):  # inner[j] = ⟨g_i', g_j⟩ / (|g_i| |g_j|)
         if min(inner) >= -TOLERANCE:
             continue
-        if order is None:
-            order = visiting_order(levels, rng).tolist()
-        for j in order[i]:
+        for j in met:
             cosine = inner[j]
             if cosine < -TOLERANCE and ranks[j] <= ranks[i] and j != i:
                 inner = [mine - cosine * its for mine, its in zip(inner, rows[j], strict=True)]
-                weights[j] -= cosine * norms[i] / norms[j]
+                weights[j] -= cosine * sizes[i] / sizes[j]
     return np.array(weights)
+
+
+def _project_rows_together(directions: Array, norms: Array, levels: Levels, order: NDArray[np.intp]) -> Array:
+    """Weights of :func:`gcr`, all components meeting their next one at the same time."""
+    each = np.arange(len(norms))
+    yields = (levels[:, None] >= levels) & (each[:, None] != each)
+    inner, removed = directions.copy(), np.zeros_like(directions)
+    for met in order.T:
+        cosine = inner[each, met]
+        cosine = np.where((cosine < -TOLERANCE) & yields[each, met], cosine, 0.0)
+        inner -= cosine[:, None] * directions[met]
+        removed[each, met] = cosine
+    return 1 - np.divide(norms @ removed, norms, out=np.zeros_like(norms), where=norms > 0)
 
 
 def no_priority(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:

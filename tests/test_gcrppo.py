@@ -493,10 +493,13 @@ def test_adaptive_learning_rate_takes_over_after_the_first_minibatch() -> None:
             ValueError,
             "Parameter `gramian_method` must be 'auto', 'one_backward' or 'passes', found 'two'.",
         ),
-        (
-            {"gramian_samples": 0},
-            ValueError,
-            "Parameter `gramian_samples` must be an integer > 0 or None, found 0.",
+        *(
+            (
+                {"gramian_samples": samples},
+                ValueError,
+                f"Parameter `gramian_samples` must be an integer > 0 or None, found {samples}.",
+            )
+            for samples in (0, 512.0)
         ),
         (
             {"rollout_buffer_class": __import__("stable_baselines3").common.buffers.RolloutBuffer},

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_gcr import RESOLVERS
-from sb3_gcr.resolvers import conflicts, cosines, from_torchjd, gcr, gcr_authors, guaranteed, no_priority, visiting_order
+from sb3_gcr.resolvers import FEW, conflicts, cosines, from_torchjd, gcr, gcr_authors, guaranteed, no_priority, visiting_order
 from tests.oracles import authors_in_place, pcgrad_with_levels, random_jacobian
 
 TASK, REGULARISER = 0, 1
@@ -49,6 +49,18 @@ def test_gcr_is_the_papers_projection_in_gradient_space(levels: list[int], seed:
     jacobian = random_jacobian(np.random.default_rng(seed), 5, 4)
     expected = pcgrad_with_levels(jacobian, levels, np.random.default_rng(seed))
     np.testing.assert_allclose(step(gcr, jacobian, levels, np.random.default_rng(seed)), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [2, FEW, FEW + 1, 30])
+@pytest.mark.parametrize("seed", range(5))
+def test_gcr_row_by_row_and_all_rows_together(n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    jacobian = random_jacobian(rng, n, n // 2 + 1)
+    jacobian[n // 2] = 0
+    levels = rng.integers(0, 3, n)
+    expected = pcgrad_with_levels(jacobian, levels, np.random.default_rng(seed))
+    actual = step(gcr, jacobian, levels, np.random.default_rng(seed))
+    np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-8 * np.abs(jacobian).max())
 
 
 @pytest.mark.parametrize("levels", [[0, 0, 0, 1, 1], [0, 1, 1, 1, 0]])
