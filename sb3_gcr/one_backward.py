@@ -4,7 +4,7 @@ With c_b^(k) = ∂L^(k)/∂log π_b the gradient of component k is g^(k) = Σ_b 
 cotangent and samples do not mix, so one backward pass of Σ_b log π_b gives every layer's signal Δ = (δ_b) for all K. With the
 layer's input H = (h_b), and S = ∂log π_b/∂log σ row by row,
 
-    G_kl = c^(k)ᵀ M c^(l),    M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ + 1) + S Sᵀ,
+    G_kl = c^(k)ᵀ M c^(l),    M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ + 1) + S Sᵀ,   (the 1 is the bias)
 
 and the step of any weights w has the weight gradients (Δ ∘ c w)ᵀ H. Forward and backward are written out here, because for
 small networks most of the time of an update is PyTorch's bookkeeping, not arithmetic.
@@ -149,7 +149,6 @@ class GaussianHead:
         self._scale = th.exp(-self.log_std)
         self._z = (actions - mean) * self._scale
         self._squares = self._z * self._z
-        self._score = self._squares - 1
         self._log_det = self.log_std.sum() + 0.5 * _LOG_2PI * mean.shape[1]
         return self._squares.sum(1).mul_(-0.5) - self._log_det
 
@@ -157,9 +156,9 @@ class GaussianHead:
         """Return ∂log π/∂μ = (a - μ) / σ², shape (B, A)."""
         return self._z * self._scale
 
-    def score(self, n_samples: int | None = None) -> th.Tensor:
-        """S = ∂log π/∂log σ = ((a - μ) / σ)² - 1 of the first n samples, shape (n, A)."""
-        return self._score[:n_samples]
+    def score(self) -> list[th.Tensor]:
+        """S = ∂log π/∂log σ = ((a - μ) / σ)² - 1, shape (B, A)."""
+        return [self._squares - 1]
 
     def entropy_loss(self) -> th.Tensor:
         """Minus the entropy Σ log σ + ½ A (1 + log 2π)."""
@@ -169,11 +168,9 @@ class GaussianHead:
         """The entropy does not depend on the mean."""
         return None
 
-    def write_gradients(self, cotangent: th.Tensor, ent_coef: float) -> None:
-        """Set the gradient of log σ: Sᵀ c, and -ent_coef from the entropy."""
-        th.mv(self._score.T, cotangent, out=self.log_std.grad)
-        if ent_coef != 0:
-            self.log_std.grad.sub_(ent_coef)
+    def add_entropy_gradient(self, ent_coef: float) -> None:
+        """Add the gradient of the entropy loss by log σ, which is -1 for each of them."""
+        self.log_std.grad.sub_(ent_coef)
 
 
 class LogitsHead:
@@ -198,9 +195,9 @@ class LogitsHead:
         """Return ∂log π/∂logits, shape (B, A)."""
         return th.autograd.grad(self._log_prob, self._logits, th.ones_like(self._log_prob), retain_graph=True)[0]
 
-    def score(self, n_samples: int | None = None) -> None:
+    def score(self) -> list[th.Tensor]:
         """There is no parameter beside the logits."""
-        return None
+        return []
 
     def entropy_loss(self) -> th.Tensor:
         """Minus the mean entropy."""
@@ -210,12 +207,12 @@ class LogitsHead:
         """Derivative of the entropy loss by the logits, shape (B, A)."""
         return th.autograd.grad(self._entropy_loss, self._logits, retain_graph=True)[0]
 
-    def write_gradients(self, cotangent: th.Tensor, ent_coef: float) -> None:
-        """Nothing to set."""
+    def add_entropy_gradient(self, ent_coef: float) -> None:
+        """There is no parameter beside the logits."""
 
 
 class OneBackward:
-    """An actor-critic of linear layers, evaluated and differentiated by hand: what ``Evaluation`` does, at PPO's price.
+    """An actor-critic of linear layers, evaluated and differentiated by hand: what ``ManyBackwards`` does, at PPO's price.
 
     Under ``torch.no_grad`` call :meth:`evaluate` with a minibatch, then :meth:`gramian` and :meth:`backward`.
 
@@ -227,14 +224,14 @@ class OneBackward:
         self.actor, self.critic = Mlp(*_actor_modules(policy)), Mlp(*_critic_modules(policy))
         gaussian = isinstance(policy.action_dist, DiagGaussianDistribution)
         self.head: GaussianHead | LogitsHead = GaussianHead(policy) if gaussian else LogitsHead(policy)
-        biases = [*self.actor.biases, *self.critic.biases]
-        # One block of memory for all gradients, biases first: their norm, their scaling, and the sums over samples that are
-        # the gradients of the biases, are then one operation each.
-        self._parameters = biases + [p for p in policy.parameters() if all(p is not bias for bias in biases)]
+        added = [*self.actor.biases, *([policy.log_std] if gaussian else []), *self.critic.biases]
+        # One block of memory for all gradients, first those that are plain sums over samples: their norm, their scaling, and
+        # these sums are then one operation each.
+        self._parameters = added + [p for p in policy.parameters() if all(p is not other for other in added)]
         self._flat = th.zeros(sum(parameter.numel() for parameter in self._parameters), device=policy.device)
         pieces = self._flat.split([parameter.numel() for parameter in self._parameters])
         self._gradients = [piece.view_as(p) for piece, p in zip(pieces, self._parameters, strict=True)]
-        self._bias_gradients = self._flat[: sum(bias.numel() for bias in biases)]
+        self._sums = self._flat[: sum(parameter.numel() for parameter in added)]
         self._widths = [bias.numel() for bias in self.actor.biases]
         extractor, space = policy.pi_features_extractor, policy.observation_space
         # Vectors pass through SB3's preprocessing and flattening as they are.
@@ -277,12 +274,14 @@ class OneBackward:
         :param cotangents: of log π, shape (B, K)
         :param n_samples: take the first n rows of the minibatch instead of all; they are in random order already
         """
-        self._signals = self.actor.signals(self.head.signal())
-        if n_samples is None:
-            return layer_gramian(self._signals, self.actor.inputs, self.head.score(), cotangents)
-        signals = [signal[:n_samples] for signal in self._signals]
-        inputs = [features[:n_samples] for features in self.actor.inputs]
-        return layer_gramian(signals, inputs, self.head.score(n_samples), cotangents[:n_samples])
+        signals = self.actor.signals(self.head.signal())
+        self._added = th.cat([*signals, *self.head.score()], 1)  # ∂log π/∂bias of all layers, and S
+        return layer_gramian(
+            [signal[:n_samples] for signal in signals],
+            [features[:n_samples] for features in self.actor.inputs],
+            self._added[:n_samples],
+            cotangents[:n_samples],
+        )
 
     def entropy_loss(self) -> th.Tensor:
         """PPO's entropy loss: minus the mean entropy."""
@@ -301,14 +300,15 @@ class OneBackward:
         column = cotangent.unsqueeze(1)
         entropy_signal = self.head.entropy_signal() if ent_coef != 0 else None
         if entropy_signal is None:
-            actor_signals = th.cat(self._signals, 1) * column
+            added = self._added * column
         else:
-            actor_signals = th.cat(self.actor.signals(self._signals[-1] * column + ent_coef * entropy_signal), 1)
+            added = th.cat(self.actor.signals(self.head.signal() * column + ent_coef * entropy_signal), 1)
         critic_signals = self.critic.signals(value_cotangents)
-        self.actor.write_weight_gradients(actor_signals.split_with_sizes(self._widths, 1))
+        self.actor.write_weight_gradients(added[:, : sum(self._widths)].split_with_sizes(self._widths, 1))
         self.critic.write_weight_gradients(critic_signals)
-        th.sum(th.cat([actor_signals, *critic_signals], 1), 0, out=self._bias_gradients)
-        self.head.write_gradients(cotangent, ent_coef)
+        th.sum(th.cat([added, *critic_signals], 1), 0, out=self._sums)
+        if ent_coef != 0:
+            self.head.add_entropy_gradient(ent_coef)
 
     def clip_gradients(self, max_norm: float) -> float:
         """Scale all gradients down to a joint norm of at most ``max_norm``, as ``clip_grad_norm_``; the norm before."""
@@ -318,14 +318,12 @@ class OneBackward:
         return norm
 
 
-def layer_gramian(
-    signals: list[th.Tensor], inputs: list[th.Tensor], score: th.Tensor | None, cotangents: th.Tensor
-) -> th.Tensor:
-    """Gramian of the K gradients Σ_b c_b^(k) (δ_b h_bᵀ, δ_b, s_b) over all layers; per layer the cheaper of two exact forms.
+def layer_gramian(signals: list[th.Tensor], inputs: list[th.Tensor], added: th.Tensor, cotangents: th.Tensor) -> th.Tensor:
+    """Gramian of the K gradients Σ_b c_b^(k) (δ_b h_bᵀ, …, a_b) over all layers; per layer the cheaper of two exact forms.
 
     :param signals: Δ of each layer, shapes (B, out)
     :param inputs: H of each layer, shapes (B, in)
-    :param score: S, shape (B, A), or None
+    :param added: derivatives a_b by parameters that each sample has a number of its own for, biases and log σ, shape (B, n)
     :param cotangents: c, shape (B, K)
     :return: G, shape (K, K)
     """
@@ -335,31 +333,31 @@ def layer_gramian(
         <= n_objectives * signal.shape[1] * features.shape[1]
         for signal, features in zip(signals, inputs, strict=True)
     ]
-    pairs = list(zip(signals, inputs, strict=True))
-    gramian = _gramian_by_samples([p for p, take in zip(pairs, by_samples, strict=True) if take], score, cotangents)
-    for (signal, features), take in zip(pairs, by_samples, strict=True):
+    layers = list(zip(signals, inputs, strict=True))
+    jacobian = th.mm(cotangents.T, added)
+    gramian = th.mm(jacobian, jacobian.T)
+    few = [layer for layer, take in zip(layers, by_samples, strict=True) if take]
+    if few:
+        gramian += _gramian_by_samples(few, cotangents)
+    for (signal, features), take in zip(layers, by_samples, strict=True):
         if not take:
             gramian += _gramian_by_weights(signal, features, cotangents)
     return gramian
 
 
-def _gramian_by_samples(
-    layers: list[tuple[th.Tensor, th.Tensor]], score: th.Tensor | None, cotangents: th.Tensor
-) -> th.Tensor:
-    """C M Cᵀ with M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ + 1) + S Sᵀ, by blocks of rows; of the symmetric M only the upper half."""
-    one = cotangents.new_ones(1, 1)
+def _gramian_by_samples(layers: list[tuple[th.Tensor, th.Tensor]], cotangents: th.Tensor) -> th.Tensor:
+    """Cᵀ M C with M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ), by blocks of rows; of the symmetric M only the upper half."""
     n_samples = len(cotangents)
     gramian: th.Tensor | float = 0.0
     height = n_samples if n_samples <= WHOLE else min(HIGHEST, max(LOWEST, n_samples // 4))
     for start in range(0, n_samples, height):
         rows, columns = slice(start, start + height), slice(start, n_samples)
-        block = None if score is None else th.mm(score[rows], score[columns].T)
+        block: th.Tensor | None = None
         for signal, features in layers:
             products = th.mm(signal[rows], signal[columns].T)
-            overlaps = th.addmm(one, features[rows], features[columns].T)
+            overlaps = th.mm(features[rows], features[columns].T)
             block = products.mul_(overlaps) if block is None else block.addcmul_(products, overlaps)
-        if block is None:
-            return cotangents.new_zeros(cotangents.shape[1], cotangents.shape[1])
+        assert block is not None
         left = cotangents[rows]
         width = len(left)
         gramian = gramian + left.T @ (block[:, :width] @ left)
@@ -379,8 +377,7 @@ def _gramian_by_weights(signal: th.Tensor, features: th.Tensor, cotangents: th.T
     for units in signal.T.split(width):
         weighted = (cotangents.T.unsqueeze(1) * units).flatten(0, 1)  # (K · units, B)
         jacobian = th.mm(weighted, features).view(n_objectives, -1)
-        biases = th.mm(cotangents.T, units.T)
-        gramian += jacobian @ jacobian.T + biases @ biases.T
+        gramian += jacobian @ jacobian.T
     return gramian
 
 
