@@ -9,6 +9,8 @@ from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticP
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from sb3_gcr.optimisers import FusedAdam
+
 
 class MultiHeadActorCriticPolicy(ActorCriticPolicy):
     """SB3's ``ActorCriticPolicy`` with V_φ(s) ∈ R^K: ``predict_values``, ``forward`` and ``evaluate_actions`` return (B, K).
@@ -34,9 +36,9 @@ class MultiHeadActorCriticPolicy(ActorCriticPolicy):
         self.value_net = nn.Linear(self.mlp_extractor.latent_dim_vf, self.n_objectives)
         if self.ortho_init:
             self.value_net.apply(partial(self.init_weights, gain=1))
-        # PyTorch's fused Adam takes the same steps up to rounding; only where the user chose no optimiser of their own.
-        kwargs = {**self.optimizer_kwargs, "fused": True} if self._fuse_optimizer else self.optimizer_kwargs
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
+        # The fused Adam takes the same steps up to rounding; only where the user chose no optimiser of their own.
+        optimizer_class: Any = FusedAdam if self._fuse_optimizer else self.optimizer_class
+        self.optimizer = optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
