@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -67,36 +67,33 @@ def _table(progress: pd.DataFrame, spec: RewardSpec) -> str:
     return format_table(rows)
 
 
-def _axes(title: str, ylabel: str) -> tuple[Figure, Any]:
+def _curves(progress: pd.DataFrame, spec: RewardSpec, key: str, total: tuple[str, str], labels: dict[str, str]) -> Figure:
+    """One curve per component, regularisers dashed, and a grey one for ``total``, a key and its label."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError("Pictures need matplotlib: pip install 'sb3_gcr[plots]'") from error
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axis = figure.subplots()
-    axis.set(title=title, ylabel=ylabel, xlabel="env steps")
+    axis.set(xlabel="env steps", **labels)
     axis.grid(alpha=0.3)
-    return figure, axis
-
-
-def _returns_figure(progress: pd.DataFrame, spec: RewardSpec) -> Figure:
-    figure, axis = _axes("Return per component", "return per episode")
     for name, level in spec:
         style = "-" if level == 0 else "--"
-        axis.plot(progress[STEPS], progress[f"rollout/ep_rew/{name}"], style, label=f"{name} ({level_label(level)})")
-    axis.plot(progress[STEPS], progress["rollout/ep_rew_mean"], "k", alpha=0.4, label="sum")
+        axis.plot(progress[STEPS], progress[f"{key}/{name}"], style, label=f"{name} ({level_label(level)})")
+    axis.plot(progress[STEPS], progress[total[0]], "k", alpha=0.4, label=total[1])
     axis.legend()
     return figure
 
 
+def _returns_figure(progress: pd.DataFrame, spec: RewardSpec) -> Figure:
+    labels = {"title": "Return per component", "ylabel": "return per episode"}
+    return _curves(progress, spec, "rollout/ep_rew", ("rollout/ep_rew_mean", "sum"), labels)
+
+
 def _conflicts_figure(progress: pd.DataFrame, spec: RewardSpec) -> Figure:
-    figure, axis = _axes("Conflicts between components", "share of minibatches in which it conflicts")
-    for name, level in spec:
-        style = "-" if level == 0 else "--"
-        axis.plot(progress[STEPS], progress[f"gcr/in_conflict/{name}"], style, label=f"{name} ({level_label(level)})")
-    axis.plot(progress[STEPS], progress["gcr/conflict_rate"], "k", alpha=0.4, label="conflicting pairs")
-    axis.set_ylim(0, 1.02)
-    axis.legend()
+    labels = {"title": "Conflicts between components", "ylabel": "share of minibatches in which it conflicts"}
+    figure = _curves(progress, spec, "gcr/in_conflict", ("gcr/conflict_rate", "conflicting pairs"), labels)
+    figure.axes[0].set_ylim(0, 1.02)
     return figure
 
 
