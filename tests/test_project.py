@@ -107,12 +107,12 @@ def test_yaml_files_parse_and_the_version_is_one() -> None:
     assert yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
 
 
-def test_make_lists_its_commands_and_refuses_without_python() -> None:
+def test_make_lists_its_commands_and_refuses_without_python(tmp_path: Path) -> None:
     listed = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for command in ("train", "test", "check", "format", "bench", "compare"):
         assert f"make {command}" in listed
     missing = subprocess.run(
-        ["make", "install", "PYTHON=no-such-python", "VENV=/tmp/no-such-environment"], cwd=ROOT, capture_output=True, text=True
+        ["make", "install", "PYTHON=no-such-python", f"VENV={tmp_path}/none"], cwd=ROOT, capture_output=True, text=True
     )
     assert missing.returncode != 0
     assert "sb3_gcr needs Python 3.10 or newer: 'no-such-python' was not found." in missing.stdout
