@@ -2,8 +2,10 @@
 
 Read the method top to bottom: ``components`` (names and levels of the reward's terms), ``advantages`` (one advantage per
 term), ``gradients`` (one gradient per term and their Gramian), ``resolvers`` (who yields to whom), ``gcrppo`` (the loop).
+``envs`` has tasks with such rewards, and a thread pool that steps hundreds of them.
 """
 
+import sb3_gcr.envs as envs
 from sb3_gcr.buffers import VectorRolloutBuffer
 from sb3_gcr.components import RewardDecomposition, RewardSpec
 from sb3_gcr.evaluation import evaluate_components
@@ -22,5 +24,6 @@ __all__ = [
     "RewardDecomposition",
     "RewardSpec",
     "VectorRolloutBuffer",
+    "envs",
     "evaluate_components",
 ]

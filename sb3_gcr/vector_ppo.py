@@ -250,6 +250,9 @@ class VectorPPO(PPO):
 
         :param iteration: current logging iteration
         """
+        n_diverged = getattr(self.env, "n_diverged", None)  # our batched envs count them
+        if n_diverged is not None:
+            self.logger.record("rollout/n_diverged", n_diverged)
         if self.n_objectives == 1:
             super().dump_logs(iteration)
             return
