@@ -22,7 +22,7 @@ $(VENV)/installed: setup.cfg pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "sb3_gcr needs pip and venv for $(PYTHON), and they are missing. On Debian and Ubuntu: apt install python3-pip python3-venv"; exit 1; }
 	@echo "== making the environment in $(VENV) (a few minutes the first time)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plots,torchjd,tests]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plots,torchjd,envpool,tests]'
 	@touch $@
 
 train: install  ## train on Humanoid-v5; TIMESTEPS=, ENV=, SEED=, RESOLVER= can be given
