@@ -43,8 +43,12 @@ ARROWS = {
     "envs.__init__": {"envs.tasks"},
     "envs.tasks": {"envs.task"},
     "envs.task": {"components"},
-    "envs.humanoid": {"components", "envs.task"},
+    "envs.geometry": set(),
+    "envs.objectives": set(),
+    "envs.humanoid": {"components", "envs.geometry", "envs.objectives", "envs.task"},
+    "envs.throwing": {"components", "envs.geometry", "envs.objectives", "envs.task"},
     "envs.planar": {"components", "envs.task"},
+    "envs.curriculum": set(),
     "envs.engine": {"envs.task"},
     "envs.single": {"components", "envs.engine", "envs.tasks"},
     "envs.batched": {"components", "envs.engine", "envs.single"},
@@ -59,6 +63,7 @@ FORBIDDEN = {
     "envs.task": {"torch", "stable_baselines3"},
     "envs.humanoid": {"torch", "stable_baselines3"},
     "envs.planar": {"torch", "stable_baselines3"},
+    "envs.throwing": {"torch", "stable_baselines3"},
     "envs.engine": {"torch", "stable_baselines3"},
 }
 MODULES = {

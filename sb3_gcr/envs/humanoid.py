@@ -5,7 +5,6 @@ The base task is that of the paper (its reward, control rate, time limit and fal
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,6 +15,8 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_gcr.components import RewardSpec
+from sb3_gcr.envs.geometry import into_frame, wrap, yaw_and_roll
+from sb3_gcr.envs.objectives import choose_ranges, inside
 from sb3_gcr.envs.task import Array, Rows, Task, unbounded
 
 #: Physics step [s] and steps per control step: 60 Hz control.
@@ -35,7 +36,7 @@ CONTACT_FORCE = 1.0
 #: Ranges of the four objectives, lower bound included, upper bound excluded.
 RANGES: dict[str, tuple[tuple[float, float], ...]] = {
     "energy": ((25, 50), (50, 100), (100, 200), (200, 400), (400, 800)),  # mechanical power [W]
-    "gait": ((0.0, 0.25), (0.25, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 2.0)),  # stride [m]
+    "gait": ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0)),  # stride [m]
     "baseh": ((0.40, 0.55), (0.55, 0.70), (0.70, 0.82), (0.82, 0.95), (0.95, 1.20)),  # height of the pelvis [m]
     "armsp": ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0)),  # distance from hand to pelvis [m]
 }
@@ -134,15 +135,6 @@ def armsp_range(distances: Array, bounds: tuple[float, float]) -> Array:
     :param bounds: lower one included, upper one excluded [m]
     """
     return 2.5 * inside(distances, bounds).sum(1)
-
-
-def inside(values: Array, bounds: tuple[float, float]) -> NDArray[np.bool_]:
-    """Whether each value is in a range; NaN is in none.
-
-    :param values: any shape
-    :param bounds: lower one included, upper one excluded
-    """
-    return (bounds[0] <= values) & (values < bounds[1])
 
 
 class HumanoidRun(Task):
@@ -295,29 +287,14 @@ class HumanoidMO(HumanoidRun):
         return np.linalg.norm(s.geom_xpos[:, self._hands] - s.xpos[:, None, self._pelvis], axis=2)
 
 
-def choose_ranges(
-    ranges: Mapping[str, tuple[tuple[float, float], ...]], chosen: Mapping[str, int | None]
-) -> dict[str, tuple[float, float]]:
-    """The bounds of the chosen objectives.
-
-    :param ranges: all ranges by objective
-    :param chosen: index of a range by objective, or None
-    :raises ValueError: for an index that is not there
-    """
-    for name, index in chosen.items():
-        if index is not None and (isinstance(index, bool) or index not in range(len(ranges[name]))):
-            raise ValueError(
-                f"Parameter `{name}` must be None or the index of one of {dict(enumerate(ranges[name]))}, found {index!r}."
-            )
-    return {name: ranges[name][index] for name, index in chosen.items() if index is not None}
-
-
 def humanoid_model() -> mujoco.MjModel:
     """Gymnasium's humanoid with an implicit integrator, and a touch sensor around each foot."""
     spec = mujoco.MjSpec.from_file(str(Path(gymnasium.__file__).parent / "envs/mujoco/assets/humanoid.xml"))
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.timestep = TIMESTEP
-    spec.geom("floor").size = [0, 0, 0.125]  # drawn without an end
+    spec.geom("floor").size = [0, 0, 0.125]  # drawn without an end, in squares of 1 m
+    floor = spec.material("MatPlane")
+    floor.texuniform, floor.texrepeat = True, [0.5, 0.5]
     for name in FEET:
         foot = spec.geom(name)
         foot.parent.add_site(name=name, pos=foot.pos, size=[1.1 * foot.size[0], 0, 0], group=4)
@@ -343,33 +320,3 @@ def torso_projections(qpos: Array) -> tuple[Array, Array]:
     forward_x, forward_y = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
     heading = (forward_x * to_target[:, 0] + forward_y * to_target[:, 1]) / distance_to_target(qpos)
     return 1 - 2 * (x * x + y * y), heading
-
-
-def yaw_and_roll(quaternion: Array) -> tuple[Array, Array]:
-    """Rotation about the vertical and about the forward axis [rad], each (N,).
-
-    :param quaternion: w, x, y, z, shape (N, 4)
-    """
-    w, x, y, z = quaternion.T
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    return yaw, roll
-
-
-def into_frame(quaternion: Array, vectors: Array) -> Array:
-    """World vectors in the frame of a rotated body, shape (N, 3).
-
-    :param quaternion: of the body, w, x, y, z, shape (N, 4)
-    :param vectors: shape (N, 3)
-    """
-    w, axis = quaternion[:, :1], -quaternion[:, 1:]
-    twice = 2 * np.cross(axis, vectors)
-    return vectors + w * twice + np.cross(axis, twice)
-
-
-def wrap(angle: Array) -> Array:
-    """An angle between -π and π.
-
-    :param angle: [rad]
-    """
-    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 TASKS: dict[str, tuple[str, int]] = {
     "HumanoidRun": ("sb3_gcr.envs.humanoid", 900),
     "HumanoidMO": ("sb3_gcr.envs.humanoid", 900),
+    "ThrowingMO": ("sb3_gcr.envs.throwing", 100),
     "Hopper": ("sb3_gcr.envs.planar", 1000),
     "Walker2d": ("sb3_gcr.envs.planar", 1000),
     "HalfCheetah": ("sb3_gcr.envs.planar", 1000),

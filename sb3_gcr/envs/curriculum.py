@@ -1,0 +1,53 @@
+"""A callback that moves the target of ThrowingMO away as the robot learns."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+
+class DistanceCurriculum(BaseCallback):
+    """Raises ThrowingMO's ``max_distance`` after each rollout, once the robot throws and stands.
+
+    It starts, for good, when the mean returns of the last 100 episodes exceed both thresholds. The distance is logged as
+    ``curriculum/max_distance``.
+
+    :param increment: by how much it raises the distance [m]
+    :param limit: largest distance [m]
+    :param throwing: threshold of the return of ``throwing``, at most 4.1
+    :param stability: threshold of the return of ``stability``, at most 0.5
+    :param verbose: as in SB3
+    """
+
+    def __init__(
+        self, increment: float = 0.01, limit: float = 5.0, throwing: float = 1.0, stability: float = 0.44, verbose: int = 0
+    ):
+        super().__init__(verbose)
+        if not 1 <= limit <= 5:
+            raise ValueError(f"Parameter `limit` must be between 1 and 5 m, found {limit!r}.")
+        if not increment > 0:
+            raise ValueError(f"Parameter `increment` must be above 0, found {increment!r}.")
+        self.increment, self.limit = increment, limit
+        self.thresholds = np.array([throwing, stability])
+        self.has_started = False
+        self._returns: deque[tuple[float, float]] = deque(maxlen=100)
+
+    def _on_step(self) -> bool:
+        for index in np.flatnonzero(self.locals["dones"]):
+            info = self.locals["infos"][index]
+            if "r_throwing" not in info:
+                raise ValueError("DistanceCurriculum needs the env 'sb3_gcr/ThrowingMO-v0', found one without `r_throwing`.")
+            self._returns.append((info["r_throwing"], info["r_stability"]))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        tasks = self.training_env.get_attr("task")
+        if self._returns and not self.has_started:
+            self.has_started = bool((np.mean(self._returns, axis=0) > self.thresholds).all())
+        if self.has_started:
+            distance = min(self.limit, tasks[0].max_distance + self.increment)
+            for task in tasks:
+                task.max_distance = distance
+        self.logger.record("curriculum/max_distance", tasks[0].max_distance)
