@@ -12,7 +12,7 @@ from pathlib import Path
 import torch as th
 from tqdm import tqdm
 
-from benchmarks import gpu, learning, memory, parts, report, updates
+from benchmarks import gpu, learning, memory, parts, report, simulations, updates
 from benchmarks.measuring import Case, Row, measure_pairs, missing
 
 GROUPS = {
@@ -20,6 +20,7 @@ GROUPS = {
     "learn": learning.cases,
     "memory": memory.cases,
     "parts": parts.cases,
+    "envs": simulations.cases,
     "gpu": gpu.cases,
 }
 

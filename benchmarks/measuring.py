@@ -24,6 +24,7 @@ UNITS: dict[str, Callable[[float], float]] = {
 NEEDS = {
     "sbx": "sbx is not installed: pip install 'sb3_gcr[bench]'.",
     "torchjd": "TorchJD is not installed: pip install 'sb3_gcr[torchjd]'.",
+    "envpool": "EnvPool is not installed: pip install 'sb3_gcr[envpool]'.",
     "cuda": "torch.cuda.is_available() is False.",
 }
 

@@ -16,7 +16,19 @@ import torch as th
 
 from benchmarks.measuring import UNITS, Row
 
-PACKAGES = ("sb3_gcr", "torch", "stable_baselines3", "numpy", "gymnasium", "mujoco", "torchjd", "sbx-rl", "jax", "jaxlib")
+PACKAGES = (
+    "sb3_gcr",
+    "torch",
+    "stable_baselines3",
+    "numpy",
+    "gymnasium",
+    "mujoco",
+    "envpool",
+    "torchjd",
+    "sbx-rl",
+    "jax",
+    "jaxlib",
+)
 #: Columns of the table that hold words.
 WORDS = 4
 EXPLANATION = (

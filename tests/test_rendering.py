@@ -28,7 +28,7 @@ many.render_index = 2
 third = many.render()
 env.close(); many.close()
 print(picture.shape, first.shape, (first != third).mean() > 0.001)
-print(((red > 120) & (green < 60) & (blue < 60)).sum() > 5, ((red > 180) & (green > 80) & (blue < 80)).sum() > 5)
+print(((red > 120) & (green < 60) & (blue < 60)).sum() > 5, ((red > 150) & (green > 70) & (red - blue > 90)).sum() > 3)
 """
 NO_CONTEXT = """
 import gymnasium as gym, sb3_gcr
