@@ -9,7 +9,7 @@ SEED ?= 0
 RESOLVER ?= gcr
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test check format pytest bench compare clean
+.PHONY: help install train test check format pytest bench build lower compare clean
 
 help:  ## list the commands
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
@@ -22,7 +22,7 @@ $(VENV)/installed: setup.cfg pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "sb3_gcr needs pip and venv for $(PYTHON), and they are missing. On Debian and Ubuntu: apt install python3-pip python3-venv"; exit 1; }
 	@echo "== making the environment in $(VENV) (a few minutes the first time)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plots,torchjd,envpool,tests]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plots,torchjd,envpool,tests,zoo]'
 	@touch $@
 
 train: install  ## train on Humanoid-v5; TIMESTEPS=, ENV=, SEED=, RESOLVER= can be given
@@ -50,8 +50,21 @@ bench: install  ## measure the update against PPO and others (under 15 minutes)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	@$(BIN)/python -m benchmarks
 
+build: install  ## make wheel and sdist in dist/, and try each in an environment of its own
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check build twine
+	@rm -rf build dist
+	@$(BIN)/python -m build
+	@$(BIN)/python -m twine check --strict dist/*
+	@$(BIN)/python tests/check_build.py
+
+lower:  ## all tests with the oldest dependencies that setup.cfg allows
+	@$(PYTHON) -m venv .venv-lower
+	@$(PYTHON) tests/lower_bounds.py > .venv-lower/constraints.txt
+	@.venv-lower/bin/python -m pip install --quiet --disable-pip-version-check -c .venv-lower/constraints.txt -e '.[plots,tests]'
+	@OMP_NUM_THREADS=1 .venv-lower/bin/python -m pytest -n 2 -W ignore::DeprecationWarning  # old packages with new ones below them
+
 compare: install  ## the table of the README: GCRPPO and PPO, several seeds
 	@$(BIN)/python examples/compare.py
 
 clean:  ## remove the environment and all caches
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-lower build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
