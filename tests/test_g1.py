@@ -10,6 +10,7 @@ import pytest
 
 import sb3_gcr
 
+pytest.importorskip("mujoco.batch")
 mujoco = pytest.importorskip("mujoco")
 
 PATH = Path(sb3_gcr.__file__).parent / "envs" / "assets" / "g1.xml"
