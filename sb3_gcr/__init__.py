@@ -7,6 +7,7 @@ term), ``gradients`` (one gradient per term and their Gramian), ``resolvers`` (w
 
 import sb3_gcr.envs as envs
 from sb3_gcr.buffers import VectorRolloutBuffer
+from sb3_gcr.checkpoints import latest_checkpoint
 from sb3_gcr.components import RewardDecomposition, RewardSpec
 from sb3_gcr.evaluation import evaluate_components
 from sb3_gcr.gcrppo import GCRPPO
@@ -26,4 +27,5 @@ __all__ = [
     "VectorRolloutBuffer",
     "envs",
     "evaluate_components",
+    "latest_checkpoint",
 ]

@@ -21,9 +21,9 @@ from sb3_gcr.components import GYMNASIUM_ENVS, RewardDecomposition
 from sb3_gcr.diagnostics import MinibatchStatistics, append_cosines, cosine_figure, mean_cosines, summarise
 from sb3_gcr.gradients import ManyBackwards, evaluate_surrogates, value_errors
 from sb3_gcr.one_backward import OneBackward
+from sb3_gcr.persistent_ppo import PersistentPPO
 from sb3_gcr.resolvers import Resolver, bind_resolver
 from sb3_gcr.schedules import adapt_learning_rate
-from sb3_gcr.vector_ppo import VectorPPO
 
 SelfGCRPPO = TypeVar("SelfGCRPPO", bound="GCRPPO")
 
@@ -31,7 +31,7 @@ SelfGCRPPO = TypeVar("SelfGCRPPO", bound="GCRPPO")
 FIGURE_INTERVAL = 10
 
 
-class GCRPPO(VectorPPO):
+class GCRPPO(PersistentPPO):
     """PPO with gradient conflict resolution (GCR-PPO, arXiv:2509.14816): a critic head, advantage and gradient per component.
 
     The env must report its reward components (see :class:`~sb3_gcr.components.RewardDecomposition`); an id of Gymnasium's

@@ -1,0 +1,61 @@
+"""VecNormalize's running statistics as plain JSON, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
+
+
+def _of_observations(vec_normalize: VecNormalize) -> dict[str, RunningMeanStd]:
+    """VecNormalize's statistics of observations by key, "" where they have none."""
+    found = getattr(vec_normalize, "obs_rms", None) or {}
+    return found if isinstance(found, dict) else {"": found}
+
+
+def describe_statistics(vec_normalize: VecNormalize) -> dict[str, Any]:
+    """VecNormalize's running means and variances as JSON.
+
+    :param vec_normalize: the wrapper of a model's env
+    """
+    observations = {key: _describe_moments(moments) for key, moments in _of_observations(vec_normalize).items()}
+    return {"observations": observations, "returns": _describe_moments(vec_normalize.ret_rms)}
+
+
+def _describe_moments(moments: RunningMeanStd) -> dict[str, Any]:
+    return {"mean": np.asarray(moments.mean).tolist(), "var": np.asarray(moments.var).tolist(), "count": float(moments.count)}
+
+
+def restore_statistics(vec_normalize: VecNormalize, saved: Mapping[str, Any], returns: bool = True) -> bool:
+    """Give saved statistics to a VecNormalize that has not seen anything yet; one that has keeps its own.
+
+    :param vec_normalize: the wrapper of a model's env
+    :param saved: of ``describe_statistics``
+    :param returns: whether to restore those of the returns, too
+    :return: whether they were restored
+    :raises ValueError: if the saved statistics are of other observations
+    """
+    observations = _of_observations(vec_normalize)
+    if any(moments.count >= 1 for moments in (*observations.values(), vec_normalize.ret_rms)):
+        return False
+    if observations and saved["observations"] and set(observations) != set(saved["observations"]):
+        raise ValueError(
+            f"VecNormalize must normalise the observations that it did for the saved model, {sorted(saved['observations'])}, "
+            f"found {sorted(observations)}."
+        )
+    for key in set(observations) & set(saved["observations"]):
+        _restore_moments(observations[key], saved["observations"][key])
+    if returns:
+        _restore_moments(vec_normalize.ret_rms, saved["returns"])
+    return True
+
+
+def _restore_moments(moments: RunningMeanStd, saved: Mapping[str, Any]) -> None:
+    mean, var = (np.array(saved[name], dtype=np.float64) for name in ("mean", "var"))
+    if mean.shape != np.shape(moments.mean) or var.shape != mean.shape:
+        raise ValueError(f"The saved statistics must have shape {np.shape(moments.mean)}, found {mean.shape} and {var.shape}.")
+    # 0-d arrays where VecNormalize has them, because SB3 pickles and compares them as they are.
+    moments.mean, moments.var, moments.count = mean, var, float(saved["count"])
