@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 Array = NDArray[np.float64]
-Levels = NDArray[np.integer[Any]]
+Levels = NDArray[Any]  # of integers, of whatever size a resolver asks for
 Resolver = Callable[[Array, Levels, np.random.Generator], Array]
 
 #: Two gradients conflict when ⟨g_i, g_j⟩ is below minus this share of |g_i| |g_j|: rounding is no conflict.
@@ -206,6 +205,8 @@ def _dual_cone_step(columns: Array, coefficients: Array, members: NDArray[np.boo
 
     min_λ |d + A_members λ|² subject to λ ≥ 0; its optimality conditions are ⟨g_j, d + A λ⟩ ≥ 0 with equality where λ_j > 0.
     """
+    from scipy.optimize import nnls  # here, because it would be a tenth of the time of `import sb3_gcr`
+
     step = np.zeros_like(coefficients)
     size = np.linalg.norm(coefficients)
     if members.any() and size > 0:
