@@ -240,6 +240,32 @@ def test_a_diverged_simulation_ends_its_own_episode_only() -> None:
     assert env.n_diverged == 1
 
 
+def test_steps_that_cannot_be_made_are_refused() -> None:
+    env = batched("Hopper", 3)
+    actions = np.zeros((3, 3), dtype=np.float32)
+    with pytest.raises(RuntimeError, match="BatchedVecEnv must be reset before a step, and cannot step after `close`"):
+        env.step(actions)
+    env.reset()
+    with pytest.raises(ValueError, match=r"Parameter `actions` must have shape \(3, 3\), found \(3,\)"):
+        env.step(actions[0])
+    env.close()
+    with pytest.raises(RuntimeError, match="cannot step after `close`"):
+        env.step(actions)
+
+
+def test_actions_that_are_no_numbers_end_their_episode() -> None:
+    env = batched("HumanoidRun", 3)
+    env.reset()
+    actions = np.zeros((3, 17), dtype=np.float32)
+    actions[1, 4] = np.nan
+    observations, rewards, dones, infos = env.step(actions)
+    assert dones.tolist() == [False, True, False]
+    assert infos[1]["diverged"]
+    assert np.isfinite(observations).all()
+    assert np.isfinite(rewards).all()
+    assert np.isfinite(env.step(np.zeros_like(actions))[0]).all()
+
+
 def test_divergence_is_logged() -> None:
     env = batched("HumanoidRun", 4)
     model = GCRPPO("MlpPolicy", env, n_steps=16, batch_size=64, n_epochs=1)

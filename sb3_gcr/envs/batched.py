@@ -48,6 +48,7 @@ class BatchedVecEnv(VecEnv):
         self._painter = Painter(self.engine, *task_env.picture_size)
         self._names = [f"r_{name}" for name in self.reward_spec.names]
         self._t_start = time.time()
+        self._is_running = False
         super().__init__(len(env_fns), self._env.observation_space, self._env.action_space)
         self._actions = np.zeros((self.num_envs, *self.task.action_space.shape), dtype=self.task.action_space.dtype)
 
@@ -63,13 +64,20 @@ class BatchedVecEnv(VecEnv):
                 self.engine.seed(index, seed)
         self._reset_seeds()
         self._reset_options()
+        self._is_running = True
         return self.engine.reset(np.arange(self.num_envs))
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Take the actions for the next step.
 
         :param actions: shape (N, n_actions)
+        :raises ValueError: for another shape
+        :raises RuntimeError: before the first reset, and after the env was closed
         """
+        if not self._is_running:
+            raise RuntimeError("BatchedVecEnv must be reset before a step, and cannot step after `close`.")
+        if np.shape(actions) != self._actions.shape:
+            raise ValueError(f"Parameter `actions` must have shape {self._actions.shape}, found {np.shape(actions)}.")
         self._actions[:] = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -109,6 +117,7 @@ class BatchedVecEnv(VecEnv):
 
     def close(self) -> None:
         """Close the window and Monitor's file, and end the threads."""
+        self._is_running = False
         self._painter.close()
         self.engine.close()
         self._env.close()
