@@ -30,9 +30,16 @@ def write_report(folder: str | Path, spec: RewardSpec) -> Report:
     :param folder: where the logger wrote ``progress.csv`` (``configure(folder, ["csv", ...])``) and GCRPPO ``cosines.csv``
     :param spec: ``model.reward_spec``, at least two components
     :raises FileNotFoundError: if the folder has no such files
+    :raises ValueError: if the log ends before the first update, or is that of other components
     :raises ImportError: if pandas or matplotlib is missing
     """
     progress, cosines = _read(folder, "progress.csv"), _read(folder, COSINES_FILE)
+    missing = [key for name in spec.names if (key := f"gcr/weight/{name}") not in progress]
+    if missing:
+        raise ValueError(
+            "Parameter `folder` must contain the log of at least two rollouts with these components, "
+            f"found none of {missing} in '{folder}/progress.csv'."
+        )
     figures = {
         "returns.png": _returns_figure(progress, spec),
         "cosines.png": _cosines_figure(cosines, spec),

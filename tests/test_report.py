@@ -52,3 +52,10 @@ def test_component_table_leaves_missing_figures_blank() -> None:
     run, save = (line for line in table.splitlines() if line.startswith(("| run", "| save")))
     assert [cell.strip() for cell in run.strip("|").split("|")] == ["run", "task", "12.3", "", "", "", ""]
     assert [cell.strip() for cell in save.strip("|").split("|")] == ["save", "regulariser", "", "1", "", "", ""]
+
+
+def test_a_log_that_ends_before_the_first_update(tmp_path: Path) -> None:
+    (tmp_path / "progress.csv").write_text("time/total_timesteps\n64\n")
+    (tmp_path / "cosines.csv").write_text("time/total_timesteps,run|save\n64,0\n")
+    with pytest.raises(ValueError, match=r"must contain the log of at least two rollouts .* found none of \['gcr/weight/run'"):
+        write_report(tmp_path, SPEC)
