@@ -26,8 +26,13 @@ for action in actions:
 first = many.render()
 many.render_index = 2
 third = many.render()
+many.engine.rows.qpos[:, 0] += 40
+many.step(actions[0])
+far = many.render().astype(int)
+skin = lambda picture: ((picture[..., 0] - picture[..., 2]) > 40).sum()
 env.close(); many.close()
 print(picture.shape, first.shape, (first != third).mean() > 0.001)
+print(skin(far) > 0.5 * skin(third.astype(int)) > 100)
 print(((red > 120) & (green < 60) & (blue < 60)).sum() > 5, ((red > 150) & (green > 70) & (red - blue > 90)).sum() > 3)
 """
 NO_CONTEXT = """
@@ -48,11 +53,11 @@ def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_target_ball_and_chosen_robot_can_be_seen() -> None:
+def test_target_ball_and_chosen_robot_can_be_seen_and_followed() -> None:
     result = run(PICTURES, MUJOCO_GL="egl")
     if result.returncode:
         pytest.skip(f"no EGL here: {result.stderr.splitlines()[-1]}")
-    assert result.stdout.splitlines() == ["(240, 320, 3) (480, 640, 3) True", "True True"]
+    assert result.stdout.splitlines() == ["(240, 320, 3) (480, 640, 3) True", "True", "True True"]
 
 
 def test_missing_opengl_is_told_in_one_sentence() -> None:

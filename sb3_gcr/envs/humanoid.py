@@ -6,7 +6,6 @@ The base task is that of the paper (its reward, control rate, time limit and fal
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
 
 import gymnasium
 import mujoco
@@ -141,7 +140,6 @@ class HumanoidRun(Task):
     """Gymnasium's humanoid runs towards a point 1000 m ahead; seven terms, with the paper's weights and levels."""
 
     n_substeps = N_SUBSTEPS
-    camera: ClassVar[dict[str, Any]] = {"trackbodyid": 1, "distance": 4.0, "lookat": np.array((0, 0, 1.0)), "elevation": -15.0}
 
     def __init__(self) -> None:
         self.model = humanoid_model()

@@ -19,6 +19,7 @@ _NO_CONTEXT = (
     "MUJOCO_GL=egl (Debian and Ubuntu: apt install libegl1 libgl1) or MUJOCO_GL=osmesa (apt install libosmesa6) "
     "before Python starts."
 )
+_WINDOW_CAMERA = {"type": mujoco.mjtCamera.mjCAMERA_TRACKING, "trackbodyid": 1, "distance": 4.0, "elevation": -15.0}
 
 
 class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]], gym.utils.EzPickle):
@@ -116,7 +117,8 @@ class Painter:
             width, height = self._size
             model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
             model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-            self._renderer = MujocoRenderer(model, self._data, self._engine.task.camera, width, height)
+            # The model's camera follows in pictures, MuJoCo's own in a window, where the mouse moves it.
+            self._renderer = MujocoRenderer(model, self._data, _WINDOW_CAMERA, width, height, camera_name="track")
         self._engine.batch.get_data(index, self._data)
         mujoco.mj_forward(model, self._data)
         try:

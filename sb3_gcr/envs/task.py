@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -43,7 +43,7 @@ class Task(ABC):
     :meth:`rewards`, :meth:`terminated` and :meth:`observe`.
     """
 
-    #: The robot.
+    #: The robot; its root is the first body, and its camera "track" follows it.
     model: mujoco.MjModel
     #: Physics steps per control step.
     n_substeps: int
@@ -55,8 +55,6 @@ class Task(ABC):
     fields: tuple[str, ...] = ("qpos", "qvel", "ctrl")
     #: Shapes of the arrays per simulation that the task keeps between steps; zero at the start of an episode.
     memory: dict[str, tuple[int, ...]]
-    #: Gymnasium's ``default_camera_config``.
-    camera: ClassVar[dict[str, Any]] = {}
 
     @property
     def dt(self) -> float:

@@ -6,7 +6,6 @@ Control rate, time limit, command and the six base terms are those of the paper;
 from __future__ import annotations
 
 from importlib.resources import files
-from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -160,7 +159,6 @@ class ThrowingMO(Task):
         "site_xpos",
         "sensordata",
     )
-    camera: ClassVar[dict[str, Any]] = {"trackbodyid": 1, "distance": 3.0, "elevation": -12.0, "azimuth": 130.0}
 
     def __init__(
         self,
