@@ -27,6 +27,11 @@ Array = NDArray[Any]
 _DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")]
 
 
+def _usable_cpus() -> int:
+    """CPUs that this process may use: fewer than the machine has, in a container or under taskset."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Step(NamedTuple):
     """What one control step of all simulations gave; the arrays are the caller's.
 
@@ -53,7 +58,7 @@ class Engine:
 
     :param task: the task
     :param n_simulations: N ≥ 1
-    :param n_threads: threads that step them; None for all CPUs
+    :param n_threads: threads that step them; None for all CPUs that this process may use
     :param max_episode_steps: control steps until truncation; None for no limit
     :raises ValueError: for a number that is not positive
     """
@@ -65,7 +70,7 @@ class Engine:
             raise ValueError(f"Parameter `n_threads` must be at least 1, or None for all CPUs, found {n_threads}.")
         self.task = task
         self.max_episode_steps = max_episode_steps
-        self.batch = Batch(task.model, n_simulations, min(n_threads or os.cpu_count() or 1, n_simulations))
+        self.batch = Batch(task.model, n_simulations, min(n_threads or _usable_cpus(), n_simulations))
         self.rows = Rows(
             {name: self.batch.bind(name) for name in {"qpos", "qvel", *task.fields}}
             | {name: np.zeros((n_simulations, *shape)) for name, shape in task.memory.items()}
