@@ -23,6 +23,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_gcr import GCRPPO, envs
+from sb3_gcr.envs.envpool_gym import pool_of
 
 if TYPE_CHECKING:
     import optuna
@@ -111,7 +112,7 @@ def _managers() -> tuple[type[ExperimentManager], type[ExperimentManager]]:
 
         def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
             given, env_id = self.monitor_kwargs, self.env_name.gym_id
-            if gym.spec(env_id).namespace == "sb3_gcr":
+            if gym.spec(env_id).namespace in ("sb3_gcr", "envpool"):
                 env = gym.make(env_id, **(self.eval_env_kwargs if eval_env else self.env_kwargs))
                 names = env.get_wrapper_attr("reward_spec").names
                 env.close()
@@ -212,12 +213,16 @@ def _take_vec_env(options: list[str], changes: ExitStack) -> list[str]:
         return options
     parser.add_argument("--env", default="CartPole-v1")  # rl-zoo3's default
     env_id = parser.parse_known_args(options)[0].env
-    if not env_id.startswith("sb3_gcr/"):
-        parser.error(f"--vec-env batch needs an env of sb3_gcr, such as 'sb3_gcr/HumanoidRun-v0', found {env_id!r}")
+    if not env_id.startswith(("sb3_gcr/", "envpool/")):
+        parser.error(
+            "--vec-env batch needs an env of sb3_gcr or EnvPool, such as 'sb3_gcr/HumanoidRun-v0' or 'envpool/Humanoid-v5', "
+            f"found {env_id!r}"
+        )
     import rl_zoo3.utils
 
-    changes.enter_context(_set(_managers()[0], "default_vec_env_cls", envs.BatchedVecEnv))
-    create = functools.partial(rl_zoo3.utils.create_test_env, vec_env_cls=envs.BatchedVecEnv)
+    make: Any = envs.BatchedVecEnv if env_id.startswith("sb3_gcr/") else pool_of
+    changes.enter_context(_set(_managers()[0], "default_vec_env_cls", staticmethod(make)))  # a function is no method there
+    create = functools.partial(rl_zoo3.utils.create_test_env, vec_env_cls=make)
     changes.enter_context(_set(rl_zoo3.utils, "create_test_env", create))  # record_video names no class
     return rest
 

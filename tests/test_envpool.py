@@ -7,9 +7,11 @@ import subprocess
 import sys
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
@@ -18,6 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecMonitor, 
 from sb3_gcr import GCRPPO
 from sb3_gcr.components import SUM_TOLERANCE, ComponentReader, find_fault
 from sb3_gcr.envs.envpool import ENVPOOL_ENVS, EnvPoolVecEnv
+from sb3_gcr.envs.envpool_gym import pool_of
 
 envpool = pytest.importorskip("envpool")
 
@@ -321,8 +324,8 @@ SETTINGS = sorted(
         ({"num_envs": True}, ValueError, "Parameter `num_envs` must be an integer ≥ 1, found True."),
         ({"num_threads": 1.5}, ValueError, "Parameter `num_threads` must be an integer ≥ 1, found 1.5."),
         ({"max_episode_steps": 0}, ValueError, "Parameter `max_episode_steps` must be an integer ≥ 1, found 0."),
-        ({"seed": -1}, ValueError, "Parameter `seed` must be None or an integer from 0 to 2147483647, found -1."),
-        ({"seed": 0.5}, ValueError, "Parameter `seed` must be None or an integer from 0 to 2147483647, found 0.5."),
+        ({"seed": -1}, ValueError, "Parameter `seed` must be None or an integer ≥ 0, found -1."),
+        ({"seed": 0.5}, ValueError, "Parameter `seed` must be None or an integer ≥ 0, found 0.5."),
         (
             {"env_id": "Ant-v9"},
             ValueError,
@@ -393,3 +396,37 @@ def test_misuse() -> None:
     with pytest.raises(NotImplementedError, match=exactly("EnvPool's envs have no Python methods, found a call of 'jump'.")):
         env.env_method("jump")
     env.close()
+
+
+def test_gymnasium_ids_make_one_env_with_the_same_numbers() -> None:
+    """Observations, rewards, terms and ends of one env are those of the pool, over several episodes."""
+    env = gym.make("envpool/Humanoid-v5")
+    pool = EnvPoolVecEnv("Humanoid-v5", 1, 1, seed=5)
+    first, rows = env.reset(seed=5)[0], pool.reset()
+    rng, n_ended = np.random.default_rng(0), 0
+    for _ in range(100):
+        np.testing.assert_array_equal(first, rows[0])
+        action = rng.uniform(-0.4, 0.4, 17).astype(np.float32)
+        first, reward, terminated, truncated, info = env.step(action)
+        rows, rewards, dones, infos = pool.step(action[None])
+        assert reward == rewards[0]
+        assert (terminated or truncated) == dones[0]
+        np.testing.assert_array_equal(info["reward_components"], pool.reward_components[0])
+        if dones[0]:
+            np.testing.assert_array_equal(first, infos[0]["terminal_observation"])
+            assert info["r_reward_quadctrl"] == pytest.approx(infos[0]["r_reward_quadctrl"], abs=1e-5)
+            first, rows = env.reset(seed=n_ended)[0], (pool.seed(n_ended), pool.reset())[1]
+            n_ended += 1
+    assert n_ended >= 2
+    env.close()
+    pool.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*render_mode")  # make_vec_env asks for pictures
+def test_pool_of_refuses_what_it_would_lose() -> None:
+    with pytest.raises(ValueError, match="so the wrapper ClipAction would never run"):
+        make_vec_env("envpool/Ant-v5", 2, wrapper_class=gym.wrappers.ClipAction, vec_env_cls=pool_of)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"needs an env of EnvPool, such as 'envpool/Humanoid-v5', found PendulumEnv\."):
+        make_vec_env("Pendulum-v1", 2, vec_env_cls=pool_of)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="Parameter `seed` must be None or an integer ≥ 0, found -3"):
+        EnvPoolVecEnv("Ant-v5", 2).seed(-3)

@@ -46,8 +46,8 @@ ARROWS = {
     "model_files": {"components", "plain_settings", "vec_statistics"},
     "persistent_ppo": {"checkpoints", "model_files", "vec_statistics", "vector_ppo", "warm_start"},
     "__init__": {"buffers", "checkpoints", "components", "envs", "evaluation", "gcrppo", "policies", "resolvers"},
-    "zoo": set(),
-    "envs.__init__": {"envs.tasks"},
+    "zoo": {"envs.envpool_gym"},
+    "envs.__init__": {"envs.envpool_gym", "envs.tasks"},
     "envs.tasks": {"envs.task"},
     "envs.task": {"components"},
     "envs.geometry": set(),
@@ -61,6 +61,7 @@ ARROWS = {
     "envs.batched": {"components", "envs.engine", "envs.single"},
     "envs.vector": {"components", "envs.engine", "envs.tasks"},
     "envs.envpool": {"components"},
+    "envs.envpool_gym": {"components", "envs.envpool"},
 }
 #: Packages that the pure modules do without.
 FORBIDDEN = {

@@ -18,10 +18,13 @@ import numpy as np
 import pytest
 import yaml
 from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gcr import GCRPPO, zoo
 from sb3_gcr.components import GYMNASIUM_ENVS
+from sb3_gcr.envs.envpool import ENVPOOL_ENVS
+from sb3_gcr.envs.envpool_gym import pool_of
 from sb3_gcr.envs.tasks import TASKS
 from sb3_gcr.zoo import main
 
@@ -69,6 +72,7 @@ def train(algo: str, env_id: str, *options: str) -> None:
 
 def test_files_have_every_env_and_differ_only_where_they_must() -> None:
     ours = {f"sb3_gcr/{name}-v0" for name in TASKS}
+    ours |= {f"envpool/{env_id}" for env_id in ENVPOOL_ENVS}
     assert set(FILES["gcrppo"]) == set(FILES["ppo"]) == set(GYMNASIUM_ENVS) | ours
     for env_id, settings in FILES["gcrppo"].items():
         only_ours = {"env_wrapper", "desired_kl"} | ({"ent_coef"} if "Throwing" in env_id else set())
@@ -88,6 +92,9 @@ def test_every_entry_makes_a_model(algo: str, env_id: str, monkeypatch: pytest.M
         pytest.skip("not registered yet")
     zoo.register()
     manager_class = zoo._managers()[0]
+    if env_id.startswith("envpool/"):
+        pytest.importorskip("envpool")
+        monkeypatch.setattr(manager_class, "default_vec_env_cls", staticmethod(pool_of))
     if env_id.startswith("sb3_gcr/"):
         monkeypatch.setattr(manager_class, "default_vec_env_cls", pytest.importorskip("sb3_gcr.envs.batched").BatchedVecEnv)
     manager = manager_class(argparse.Namespace(), algo, env_id, "logs", eval_freq=-1, verbose=0, device="cpu")
@@ -184,6 +191,20 @@ def test_batched_envs_train_evaluate_and_play(capsys: pytest.CaptureFixture[str]
 
 
 @needs_tasks
+def test_envpools_envs_train_and_play(capsys: pytest.CaptureFixture[str]) -> None:
+    """In one pool, with the terms in Monitor's file; the model is played in one env."""
+    pytest.importorskip("envpool")
+    env_id, small = "envpool/Reacher-v5", ["-params", "n_envs:8", "n_steps:64", "batch_size:128", "n_epochs:1"]
+    train("gcrppo", env_id, "--vec-env", "batch", "-n", "512", "--eval-freq", "-1", *small)
+    folder = Path("logs/gcrppo/envpool-Reacher-v5_1")
+    episodes = load_results(str(folder))
+    assert len(episodes) >= 8
+    np.testing.assert_allclose(episodes["r_reward_dist"] + episodes["r_reward_ctrl"], episodes["r"], atol=1e-4)
+    for vec_env in ([], ["--vec-env", "batch"]):
+        main(["enjoy", "--algo", "gcrppo", "--env", env_id, "-f", "logs", "-n", "60", "--no-render", *vec_env])
+        assert "Episode Reward" in capsys.readouterr().out
+
+
 def test_single_envs_log_their_terms_too() -> None:
     train("ppo", "sb3_gcr/Hopper-v0", "-n", "128", "--eval-freq", "-1", *SMALL, "n_envs:2")
     for path in Path("logs/ppo/sb3_gcr-Hopper-v0_1").glob("*.monitor.csv"):
@@ -315,7 +336,10 @@ def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     [
         ([], "sb3-gcr-zoo: error: the following arguments are required: command"),
         (["play"], "sb3-gcr-zoo: error: argument command: invalid choice: 'play' (choose from"),
-        (["train", "--vec-env", "batch", "--env", "Ant-v5"], "--vec-env batch needs an env of sb3_gcr, such as '" + RUN),
+        (
+            ["train", "--vec-env", "batch", "--env", "Ant-v5"],
+            "--vec-env batch needs an env of sb3_gcr or EnvPool, such as '" + RUN,
+        ),
         (["enjoy", "--vec-env", "x"], "sb3-gcr-zoo enjoy: error: argument --vec-env: invalid choice: 'x' (choose from"),
         (["train", "--algo", "x"], "sb3-gcr-zoo train: error: argument --algo: invalid choice: 'x' (choose from"),
         (["tune_entropy", "--algo", "ppo"], "sb3-gcr-zoo tune_entropy: error: the following arguments are required: --env"),

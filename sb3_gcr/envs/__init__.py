@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from sb3_gcr.envs.envpool_gym import register_pools
 from sb3_gcr.envs.tasks import TASKS
 
 _VEC_ENVS = {"BatchedVecEnv": "sb3_gcr.envs.batched", "EnvPoolVecEnv": "sb3_gcr.envs.envpool"}
@@ -42,3 +43,4 @@ def __getattr__(name: str) -> Any:
 
 
 register_envs()
+register_pools()

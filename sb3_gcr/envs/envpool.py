@@ -128,14 +128,14 @@ class EnvPoolVecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seeds of the pool that the next ``reset`` makes.
 
-        :param seed: env i gets ``seed + i``; None draws one
+        :param seed: env i gets ``seed + i``; None draws one. EnvPool's seeds end below 2³¹, so it is taken modulo 2³¹ - N
         :return: the seed of each env
         """
         largest = 2**31 - self.num_envs
         seed = int(np.random.randint(largest)) if seed is None else seed
-        if not isinstance(seed, int | np.integer) or not 0 <= seed <= largest:
-            raise ValueError(f"Parameter `seed` must be None or an integer from 0 to {largest}, found {seed!r}.")
-        return super().seed(int(seed))
+        if not isinstance(seed, int | np.integer) or seed < 0:
+            raise ValueError(f"Parameter `seed` must be None or an integer ≥ 0, found {seed!r}.")
+        return super().seed(int(seed) % largest)
 
     def reset(self) -> VecEnvObs:
         """Start a new episode in each env.
@@ -219,11 +219,12 @@ class EnvPoolVecEnv(VecEnv):
             row["terminal_observation"] = {key: value[index].copy() for key, value in observations.items()}
         else:
             row["terminal_observation"] = observations[index].copy()
+        row.update({f"r_{name}": value for name, value in zip(self.reward_spec.names, returns, strict=True)})
         row["episode"] = {
             "r": round(sum(returns), 6),
             "l": int(info["elapsed_step"][index]),
             "t": round(time.time() - self._start_time, 6),
-            **{f"r_{name}": value for name, value in zip(self.reward_spec.names, returns, strict=True)},
+            **{f"r_{name}": row[f"r_{name}"] for name in self.reward_spec.names},
         }
         return row
 
