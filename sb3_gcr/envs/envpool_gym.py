@@ -84,17 +84,18 @@ def pool_of(env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], n_threads: int |
     :param n_threads: threads that step the envs; None for all CPUs
     :raises ValueError: for an env that is not EnvPool's, or for a wrapper that would be lost
     """
-    env, monitor = env_fns[0](), None
-    first = env
+    first = env_fns[0]()
+    made = first.unwrapped
+    if not isinstance(made, EnvPoolEnv):
+        raise ValueError(f"`pool_of` needs an env of EnvPool, such as 'envpool/Humanoid-v5', found {type(made).__name__}.")
+    env, monitor = first, None
     while isinstance(env, gym.Wrapper):
         monitor = env if isinstance(env, Monitor) else monitor
         if not isinstance(env, Monitor | OrderEnforcing | PassiveEnvChecker):
             raise ValueError(f"EnvPool steps the envs itself, so the wrapper {type(env).__name__} would never run.")
         env = env.env
-    if not isinstance(env, EnvPoolEnv):
-        raise ValueError(f"`pool_of` needs an env of EnvPool, such as 'envpool/Humanoid-v5', found {type(env).__name__}.")
     first.close()
-    pool = EnvPoolVecEnv(num_envs=len(env_fns), num_threads=n_threads, **env.arguments)
+    pool = EnvPoolVecEnv(num_envs=len(env_fns), num_threads=n_threads, **made.arguments)
     if monitor is None or monitor.results_writer is None:
         return pool
     with warnings.catch_warnings():
