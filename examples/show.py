@@ -102,7 +102,7 @@ class Run:
             if step >= first and (step - first) % every == 0:
                 picture = env.render()
                 assert picture is not None
-                shown.append(picture[:, 140:-140])
+                shown.append(picture[100:460, 140:-140])  # the sky and the floor around the robot say nothing
             observation, *_ = env.step(model.predict(observation, deterministic=True)[0])
         env.close()
         return np.concatenate(shown, axis=1)
