@@ -52,8 +52,11 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytes
         pytest.importorskip(module)
     learn, n_rollouts = GCRPPO.learn, 2 if "write_report" in page.read_text(encoding="utf-8") else 1
 
+    learned: list[GCRPPO] = []
+
     def learn_a_little(self: GCRPPO, total_timesteps: int, *args: Any, **kwargs: Any) -> GCRPPO:
         self.n_epochs = 1
+        learned.append(self)
         return learn(self, min(total_timesteps, n_rollouts * self.n_steps * self.n_envs), *args, **kwargs)
 
     monkeypatch.setattr(GCRPPO, "learn", learn_a_little)
@@ -70,8 +73,9 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytes
             with pytest.raises((Exception, Warning), match=expected) as error:
                 exec(compiled, namespace)
         assert error.type.__name__ == kind
-    if isinstance(model := namespace.get("model"), GCRPPO) and hasattr(model, "_logger"):
-        model.logger.close()
+    for model in learned:  # with their loggers, which would otherwise be collected with open files
+        if hasattr(model, "_logger"):
+            model.logger.close()
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CHANGELOG.md"], ids=lambda p: p.name)
