@@ -176,5 +176,10 @@ def test_curriculum_refuses_what_it_cannot_do() -> None:
     with pytest.raises(ValueError, match="Parameter `increment` must be above 0, found 0"):
         DistanceCurriculum(increment=0)
     model = GCRPPO("MlpPolicy", "CartPole-v1", n_steps=64, batch_size=64)
-    with pytest.raises(ValueError, match="DistanceCurriculum needs the env 'sb3_gcr/ThrowingMO-v0'"):
+    with pytest.raises(
+        ValueError, match="DistanceCurriculum needs the env 'sb3_gcr/ThrowingMO-v0', found one without targets"
+    ):
+        model.learn(64, callback=DistanceCurriculum())
+    model = GCRPPO("MlpPolicy", "sb3_gcr/HumanoidRun-v0", n_steps=64, batch_size=64)
+    with pytest.raises(ValueError, match="found one without targets"):
         model.learn(64, callback=DistanceCurriculum())

@@ -34,11 +34,14 @@ class DistanceCurriculum(BaseCallback):
         self.has_started = False
         self._returns: deque[tuple[float, float]] = deque(maxlen=100)
 
+    def _on_training_start(self) -> None:
+        tasks = self.training_env.get_attr("task") if self.training_env.has_attr("task") else [None]
+        if not hasattr(tasks[0], "max_distance"):
+            raise ValueError("DistanceCurriculum needs the env 'sb3_gcr/ThrowingMO-v0', found one without targets.")
+
     def _on_step(self) -> bool:
         for index in np.flatnonzero(self.locals["dones"]):
             info = self.locals["infos"][index]
-            if "r_throwing" not in info:
-                raise ValueError("DistanceCurriculum needs the env 'sb3_gcr/ThrowingMO-v0', found one without `r_throwing`.")
             self._returns.append((info["r_throwing"], info["r_stability"]))
         return True
 
