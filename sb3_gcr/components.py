@@ -79,6 +79,11 @@ class RewardSpec:
         """Levels by name, in order."""
         return dict(zip(self.names, self.levels, strict=True))
 
+    @property
+    def return_keys(self) -> tuple[str, ...]:
+        """Info keys under which our envs report the return of each component, for Monitor's ``info_keywords``."""
+        return tuple(f"r_{name}" for name in self.names)
+
     def __len__(self) -> int:
         return len(self.names)
 

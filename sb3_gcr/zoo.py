@@ -114,9 +114,8 @@ def _managers() -> tuple[type[ExperimentManager], type[ExperimentManager]]:
             given, env_id = self.monitor_kwargs, self.env_name.gym_id
             if gym.spec(env_id).namespace in ("sb3_gcr", "envpool"):
                 env = gym.make(env_id, **(self.eval_env_kwargs if eval_env else self.env_kwargs))
-                names = env.get_wrapper_attr("reward_spec").names
+                self.monitor_kwargs = {"info_keywords": env.get_wrapper_attr("reward_spec").return_keys, **given}
                 env.close()
-                self.monitor_kwargs = {"info_keywords": tuple(f"r_{name}" for name in names), **given}
             try:
                 return super().create_envs(n_envs, eval_env, no_log)
             finally:

@@ -13,6 +13,7 @@ from sb3_gcr import GCRPPO
 from sb3_gcr.envs import BatchedVecEnv, throwing
 from sb3_gcr.envs.curriculum import DistanceCurriculum
 from sb3_gcr.envs.engine import Engine
+from sb3_gcr.envs.tasks import TASKS
 
 OBJECTIVES = ("energy", "baseh", "ballrel", "bodymo", "lftarm", "rgtarm")
 HOLD, OPEN = np.zeros((1, 24), np.float32), np.zeros((1, 24), np.float32)
@@ -150,6 +151,10 @@ def test_all_joints_are_found() -> None:
     assert len(task._fingers) == 6
     assert task._is_hand.sum() == 14
     assert len(task._touches) == 31
+
+
+def test_time_limit_is_that_of_the_env() -> None:
+    assert TASKS["ThrowingMO"][1] == throwing.EPISODE_STEPS
 
 
 def test_wrong_range_is_refused() -> None:

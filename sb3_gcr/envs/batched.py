@@ -46,7 +46,6 @@ class BatchedVecEnv(VecEnv):
         #: Which simulation `render` shows.
         self.render_index = 0
         self._painter = Painter(self.engine, *task_env.picture_size)
-        self._names = [f"r_{name}" for name in self.reward_spec.names]
         self._t_start = time.time()
         self._is_running = False
         super().__init__(len(env_fns), self._env.observation_space, self._env.action_space)
@@ -94,7 +93,7 @@ class BatchedVecEnv(VecEnv):
                     COMPONENTS_KEY: step.components[index].copy(),
                     "terminal_observation": step.observations[index].copy(),
                     "TimeLimit.truncated": bool(step.truncated[index] and not step.terminated[index]),
-                    **dict(zip(self._names, self.engine.returns[index].tolist(), strict=True)),
+                    **dict(zip(self.reward_spec.return_keys, self.engine.returns[index].tolist(), strict=True)),
                 }
                 if step.diverged[index]:
                     infos[index]["diverged"] = True
@@ -145,7 +144,7 @@ class BatchedVecEnv(VecEnv):
         return [self._env.get_wrapper_attr(attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of the task that all simulations share.
+        """Set an attribute of the env that all simulations share; those of its task are set on ``get_attr("task")[0]``.
 
         :param attr_name: its name
         :param value: its value

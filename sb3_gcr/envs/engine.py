@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from sb3_gcr.envs.task import Rows, Task
+from sb3_gcr.envs.task import Array, Rows, Task
 
 try:
     from mujoco.batch import Batch, SimulationError
@@ -20,8 +20,6 @@ except ImportError as error:
         "The envs of sb3_gcr need MuJoCo 4.0 or newer (Python 3.11 or newer), "
         f"found {mujoco.__version__}: pip install -U 'mujoco>=4'"
     ) from error
-
-Array = NDArray[Any]
 
 #: Warnings after which MuJoCo puts a simulation back to its defaults, or drops its controls.
 _DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")]

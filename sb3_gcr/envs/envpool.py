@@ -219,12 +219,13 @@ class EnvPoolVecEnv(VecEnv):
             row["terminal_observation"] = {key: value[index].copy() for key, value in observations.items()}
         else:
             row["terminal_observation"] = observations[index].copy()
-        row.update({f"r_{name}": value for name, value in zip(self.reward_spec.names, returns, strict=True)})
+        by_key = dict(zip(self.reward_spec.return_keys, returns, strict=True))
+        row.update(by_key)
         row["episode"] = {
             "r": round(sum(returns), 6),
             "l": int(info["elapsed_step"][index]),
             "t": round(time.time() - self._start_time, 6),
-            **{f"r_{name}": row[f"r_{name}"] for name in self.reward_spec.names},
+            **by_key,
         }
         return row
 

@@ -52,7 +52,10 @@ class EnvPoolEnv(gym.Env[Any, Any]):
         observations, rewards, dones, infos = self._pool.step(np.asarray(action)[None])
         components = self._pool.reward_components[0]
         self._returns += components
-        info = {COMPONENTS_KEY: components.copy(), **returns_by_name(self.reward_spec.names, self._returns)}
+        info = {
+            COMPONENTS_KEY: components.copy(),
+            **dict(zip(self.reward_spec.return_keys, self._returns.tolist(), strict=True)),
+        }
         truncated = bool(infos[0].get("TimeLimit.truncated", False))
         observation = infos[0]["terminal_observation"] if dones[0] else _first(observations)
         return observation, float(rewards[0]), bool(dones[0]) and not truncated, truncated, info
@@ -64,15 +67,6 @@ class EnvPoolEnv(gym.Env[Any, Any]):
 
 def _first(observations: Any) -> Any:
     return {key: rows[0] for key, rows in observations.items()} if isinstance(observations, dict) else observations[0]
-
-
-def returns_by_name(names: Sequence[str], returns: Any) -> dict[str, float]:
-    """Returns of components under the keys that Monitor's ``info_keywords`` can name.
-
-    :param names: of the components
-    :param returns: of the components, shape (K,)
-    """
-    return {f"r_{name}": float(value) for name, value in zip(names, returns, strict=True)}
 
 
 def pool_of(env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], n_threads: int | None = None) -> VecEnv:

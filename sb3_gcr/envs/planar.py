@@ -55,26 +55,25 @@ class PlanarTask(Task):
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         self.action_space = spaces.Box(low, high, dtype=np.float32)
         self.observation_space = unbounded(self.model.nq - self.n_hidden + self.model.nv, np.float64)
-        self.memory = {"x_before": (), "actions": (self.model.nu,)}
-        self._initial_qpos = self.model.qpos0.copy()
+        self.memory = {"x_before": ()}
 
     def start(self, rng: np.random.Generator) -> dict[str, ArrayLike]:
         """Noise around the model's pose, from the same draws as in Gymnasium."""
         return {
-            "qpos": self._initial_qpos + rng.uniform(-self.noise, self.noise, self.model.nq),
+            "qpos": self.model.qpos0 + rng.uniform(-self.noise, self.noise, self.model.nq),
             "qvel": rng.uniform(-self.noise, self.noise, self.model.nv),
         }
 
     def act(self, s: Rows, actions: Array) -> None:
         """Torques are the actions."""
         s.x_before[:] = s.qpos[:, 0]
-        s.actions[:] = s.ctrl[:] = actions
+        s.ctrl[:] = actions
 
     def rewards(self, s: Rows) -> list[Array]:
         """Speed minus the cost of the actions."""
         return [
             reward_forward(s.qpos[:, 0], s.x_before, self.dt),
-            reward_ctrl(s.actions.astype(np.float32), self.ctrl_cost_weight),
+            reward_ctrl(s.ctrl.astype(np.float32), self.ctrl_cost_weight),
         ]
 
     def terminated(self, s: Rows) -> NDArray[np.bool_]:
@@ -94,7 +93,7 @@ class HalfCheetah(PlanarTask):
     def start(self, rng: np.random.Generator) -> dict[str, ArrayLike]:
         """Uniform positions, normal velocities."""
         return {
-            "qpos": self._initial_qpos + rng.uniform(-self.noise, self.noise, self.model.nq),
+            "qpos": self.model.qpos0 + rng.uniform(-self.noise, self.noise, self.model.nq),
             "qvel": self.noise * rng.standard_normal(self.model.nv),
         }
 

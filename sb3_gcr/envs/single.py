@@ -71,10 +71,10 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]], gym.utils.EzPickle):
         :param action: inside the action space
         """
         step = self.engine.step(np.asarray(action, dtype=self.action_space.dtype)[None])
-        components, names = step.components[0], self.reward_spec.names
-        info: dict[str, Any] = dict(zip(names, components.tolist(), strict=True))
+        components = step.components[0]
+        info: dict[str, Any] = dict(zip(self.reward_spec.names, components.tolist(), strict=True))
         info[COMPONENTS_KEY] = components
-        info.update(zip(map("r_{}".format, names), self.engine.returns[0].tolist(), strict=True))
+        info.update(zip(self.reward_spec.return_keys, self.engine.returns[0].tolist(), strict=True))
         if step.diverged[0]:
             info["diverged"] = True
         if self.render_mode == "human":

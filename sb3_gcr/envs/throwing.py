@@ -257,9 +257,7 @@ class ThrowingMO(Task):
         """The six terms of the paper, then the chosen objectives."""
         is_released = s.releases > 0
         miss = np.full(len(s.qpos), np.nan)
-        thrown = np.flatnonzero(is_released)
-        distance, _ = closest_approach(s.qpos[thrown, self._ball], s.qvel[thrown, self._ball_velocity], s.target[thrown])
-        miss[thrown] = distance / np.linalg.norm(s.target[thrown], axis=1)
+        miss[is_released], _ = self.foresee(s.take(is_released))
         is_late = (s.time_step >= EPISODE_STEPS) & (s.has_thrown == 0)
         terms = {
             "energy": lambda bounds: paid_each_step(self.power(s), bounds),
@@ -289,9 +287,7 @@ class ThrowingMO(Task):
         down = np.zeros((len(s.qpos), 3))
         down[:, 2] = -1
         joints = (s.qpos[:, self._joints] - self._default[self._joints])[:, self._body]
-        ball, velocity = s.qpos[:, self._ball], s.qvel[:, self._ball_velocity]
-        distance, time = closest_approach(ball, velocity, s.target)
-        score = 1 - np.minimum(1, distance / np.sqrt(np.square(s.target).sum(1)))
+        miss, time = self.foresee(s)
         return np.concatenate(
             [
                 s.qvel[:, 3:6],
@@ -301,12 +297,17 @@ class ThrowingMO(Task):
                 joints,
                 s.qvel[:, 6 : 6 + self.model.nu][:, self._body],
                 s.actions,
-                np.stack([s.has_thrown == 0, score, time], axis=1),
-                into_frame(quaternion, velocity),
+                np.stack([s.has_thrown == 0, np.maximum(0, 1 - miss), time], axis=1),
+                into_frame(quaternion, s.qvel[:, self._ball_velocity]),
             ],
             axis=1,
             dtype=np.float32,
         )
+
+    def foresee(self, s: Rows) -> tuple[Array, Array]:
+        """The miss if the ball flew freely from now on, over the target's distance, and the time until then [s], each (n,)."""
+        distance, time = closest_approach(s.qpos[:, self._ball], s.qvel[:, self._ball_velocity], s.target)
+        return distance / np.linalg.norm(s.target, axis=1), time
 
     def torques(self, s: Rows) -> Array:
         """Torques of the PD controllers [N m], shape (N, 37); the model has their damping in the joints."""
