@@ -61,6 +61,15 @@ ACTIVATIONS = (
 )
 
 
+def tanh_(preactivation: th.Tensor) -> th.Tensor:
+    """Hyperbolic tangent in place; on the CPU by NumPy, which takes a fifth of PyTorch's time on an AMD EPYC."""
+    if preactivation.device.type != "cpu":
+        return preactivation.tanh_()
+    array = preactivation.numpy()
+    np.tanh(array, out=array)
+    return preactivation
+
+
 class Activation:
     """An activation behind a linear layer, and its derivative: closed where that is cheap, PyTorch's elsewhere.
 
@@ -71,7 +80,7 @@ class Activation:
         # The functions themselves: a call of a module costs as much as the arithmetic of a small layer.
         self.forward: Callable[[th.Tensor], th.Tensor] = module.forward
         if isinstance(module, nn.Tanh):
-            self.forward, self.backward = th.tanh, _aten.tanh_backward.default
+            self.forward, self.backward = tanh_, _aten.tanh_backward.default
         elif isinstance(module, nn.ReLU):
             self.forward, self.backward = th.relu, partial(_aten.threshold_backward.default, threshold=0)
         elif isinstance(module, nn.ELU):
@@ -347,8 +356,8 @@ def layer_gramian(signals: list[th.Tensor], inputs: list[th.Tensor], added: th.T
 
 def _gramian_by_samples(layers: list[tuple[th.Tensor, th.Tensor]], cotangents: th.Tensor) -> th.Tensor:
     """Cᵀ M C with M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ), by blocks of rows; of the symmetric M only the upper half."""
-    n_samples = len(cotangents)
-    gramian: th.Tensor | float = 0.0
+    n_samples, n_objectives = cotangents.shape
+    gramian = cotangents.new_zeros(n_objectives, n_objectives)
     height = n_samples if n_samples <= WHOLE else min(HIGHEST, max(LOWEST, n_samples // 4))
     for start in range(0, n_samples, height):
         rows, columns = slice(start, start + height), slice(start, n_samples)
@@ -358,14 +367,10 @@ def _gramian_by_samples(layers: list[tuple[th.Tensor, th.Tensor]], cotangents: t
             overlaps = th.mm(features[rows], features[columns].T)
             block = products.mul_(overlaps) if block is None else block.addcmul_(products, overlaps)
         assert block is not None
-        left = cotangents[rows]
-        width = len(left)
-        gramian = gramian + left.T @ (block[:, :width] @ left)
-        if start + width < n_samples:
-            off_diagonal = left.T @ (block[:, width:] @ cotangents[start + width :])
-            gramian = gramian + off_diagonal + off_diagonal.T
-    assert isinstance(gramian, th.Tensor)
-    return gramian
+        left = th.mm(cotangents[rows].T, block)  # few rows: much faster than few columns, (block @ cotangents)
+        left[:, :height].mul_(0.5)  # the transposed half adds the rest of the symmetric square on the diagonal
+        gramian.addmm_(left, cotangents[columns])
+    return gramian + gramian.T
 
 
 def _gramian_by_weights(signal: th.Tensor, features: th.Tensor, cotangents: th.Tensor) -> th.Tensor:

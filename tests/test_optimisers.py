@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch as th
+from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from sb3_gcr.optimisers import FusedAdam
 
@@ -92,3 +93,35 @@ def test_groups_closures_and_copies() -> None:
     assert optimizer.step(lambda: th.tensor(7.0)) == 7
     clone = copy.deepcopy(optimizer)
     assert clone.state_dict()["state"][0]["step"] == optimizer.state_dict()["state"][0]["step"] == 3
+
+
+@pytest.mark.parametrize("other_adams", [False, True])
+def test_hooks_run_once_a_step(other_adams: bool) -> None:
+    _, (parameters, optimizer) = networks({"lr": 0.01})
+    if other_adams:  # PyTorch wraps the step of a class when the first of its optimisers is made
+        th.optim.Adam([th.nn.Parameter(th.ones(1))])
+    calls: list[str] = []
+    train([(parameters, optimizer)], 2)
+    handles = [
+        optimizer.register_step_pre_hook(lambda *_: calls.append("before")),
+        optimizer.register_step_post_hook(lambda *_: calls.append("after")),
+    ]
+    train([(parameters, optimizer)], 2)
+    assert calls == ["before", "after"] * 2
+    for handle in handles:
+        handle.remove()
+    train([(parameters, optimizer)], 2)
+    assert len(calls) == 4
+    assert [state["step"] for state in optimizer.state.values()] == [6] * len(SHAPES)
+
+
+def test_hooks_of_all_optimisers_run() -> None:
+    calls: list[Any] = []
+    handle = register_optimizer_step_post_hook(lambda optimizer, *_: calls.append(optimizer))
+    try:
+        pairs = networks({"lr": 0.01})
+        train(pairs, 4)
+        same(pairs)
+    finally:
+        handle.remove()
+    assert calls == [pairs[0][1]] * 4 + [pairs[1][1]] * 4
