@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_gcr import GCRPPO, RESOLVERS, RewardDecomposition
 from sb3_gcr.advantages import normalize_jointly
 from sb3_gcr.diagnostics import format_table
-from sb3_gcr.gradients import evaluate_surrogates
+from sb3_gcr.gradients import surrogate_cotangents
 from sb3_gcr.one_backward import OneBackward
 from sb3_gcr.resolvers import conflicts
 
@@ -42,7 +42,7 @@ class Agreement(BaseCallback):
             for array in (normalize_jointly(buffer.advantages), buffer.observations, buffer.actions, buffer.log_probs)
         )
         networks = OneBackward(model.policy).evaluate(observations, actions)
-        cotangents = evaluate_surrogates(networks.log_prob, log_probs.flatten(), advantages, 0.2).cotangents
+        cotangents = surrogate_cotangents(networks.log_prob, log_probs.flatten(), advantages, 0.2)
         gramian = networks.gramian(cotangents).double().numpy()
         exact = RESOLVERS["gcr"](gramian, levels, np.random.default_rng(0))
         for size in SIZES:

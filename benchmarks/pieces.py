@@ -12,7 +12,7 @@ from benchmarks.rollouts import Setting, evaluate, fill_buffer, make_model, make
 from benchmarks.updates import LARGE_2048, SMALL, SMALL_256
 from sb3_gcr import GCRPPO, RESOLVERS
 from sb3_gcr.diagnostics import format_table
-from sb3_gcr.gradients import evaluate_surrogates, value_errors
+from sb3_gcr.gradients import surrogate_cotangents, value_cotangents
 from sb3_gcr.one_backward import OneBackward
 
 SETTINGS = [(SMALL, 4), (SMALL, 20), (SMALL_256, 10), (LARGE_2048, 10)]
@@ -43,25 +43,25 @@ def pieces(setting: Setting, n_components: int) -> dict[str, float]:
     batch = next(iter(model.rollout_buffer.get(setting.batch_size)))
     networks = OneBackward(model.policy).evaluate(batch.observations, batch.actions)
     arguments = (batch.old_log_prob, batch.advantages, 0.2)
-    cotangents = evaluate_surrogates(networks.log_prob, *arguments).cotangents
-    value_cotangents = value_errors(networks.values, batch.old_values, batch.returns, None)[1]
+    cotangents = surrogate_cotangents(networks.log_prob, *arguments)
+    value_gradients = value_cotangents(networks.values, batch.old_values, batch.returns, None)
     gramian = networks.gramian(cotangents).double().numpy()
     levels, rng = np.array(model.reward_spec.levels), np.random.default_rng(0)
 
-    def losses() -> None:
-        evaluate_surrogates(networks.log_prob, *arguments)
-        value_errors(networks.values, batch.old_values, batch.returns, None)
+    def derivatives() -> None:
+        surrogate_cotangents(networks.log_prob, *arguments)
+        value_cotangents(networks.values, batch.old_values, batch.returns, None)
 
-    networks.backward(cotangents.sum(1), value_cotangents, 0.0)
+    networks.backward(cotangents.sum(1), value_gradients, 0.0)
     model.policy.optimizer.step()
     n_batches = setting.n_samples // setting.batch_size
     return {
         "minibatch from the rollout": microseconds(lambda: list(model.rollout_buffer.get(setting.batch_size))) / n_batches,
         "forward pass": microseconds(lambda: networks.evaluate(batch.observations, batch.actions)),
-        "losses and their derivatives": microseconds(losses),
+        "derivatives of the losses": microseconds(derivatives),
         "signals and Gramian": microseconds(lambda: networks.gramian(cotangents)),
         "resolver": microseconds(lambda: RESOLVERS["gcr"](gramian, levels, rng)),
-        "backward pass": microseconds(lambda: networks.backward(cotangents.sum(1), value_cotangents, 0.0)),
+        "backward pass": microseconds(lambda: networks.backward(cotangents.sum(1), value_gradients, 0.0)),
         "norm and clip": microseconds(lambda: networks.clip_gradients(0.5)),
         "Adam": microseconds(model.policy.optimizer.step),
     }

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import torch as th
 from numpy.typing import NDArray
 
 from sb3_gcr.components import RewardSpec, level_label
+from sb3_gcr.gradients import kl_estimates, surrogate_losses, value_errors
 from sb3_gcr.resolvers import conflicts, cosines
 
 if TYPE_CHECKING:
@@ -20,48 +22,82 @@ if TYPE_CHECKING:
 COSINES_FILE = "cosines.csv"
 
 
-class MinibatchStatistics(NamedTuple):
-    """Figures of one minibatch, on the host; K components."""
+class Minibatch(NamedTuple):
+    """What one minibatch of B samples and K components leaves for the log: tensors as they are, arrays on the host."""
 
-    epoch: int
+    log_prob: th.Tensor  # (B,)
+    old_log_prob: th.Tensor  # (B,)
+    advantages: th.Tensor  # (B, K)
+    values: th.Tensor  # (B, K)
+    old_values: th.Tensor  # (B, K)
+    returns: th.Tensor  # (B, K)
+    entropy_loss: th.Tensor  # ()
+    kappa: th.Tensor  # ()
     gramian: NDArray[np.float64]  # (K, K)
     weights: NDArray[np.float64]  # (K,)
-    policy_losses: NDArray[np.float64]  # (K,)
-    value_losses: NDArray[np.float64]  # (K,)
-    entropy_loss: float
-    clip_fraction: float
-    approx_kl: float
-    kappa: float
 
 
-def summarise(minibatches: Sequence[MinibatchStatistics], spec: RewardSpec) -> tuple[dict[str, float], dict[str, float]]:
-    """Means over all minibatches of an update, by logger key.
+class EpochStatistics(NamedTuple):
+    """Figures of the M minibatches of an epoch, on the host; K components."""
+
+    gramians: NDArray[np.float64]  # (M, K, K)
+    weights: NDArray[np.float64]  # (M, K)
+    policy_losses: NDArray[np.float64]  # (M, K)
+    value_losses: NDArray[np.float64]  # (M, K)
+    clip_fractions: NDArray[np.float64]  # (M,)
+    kl: NDArray[np.float64]  # (M,)
+    entropy_losses: NDArray[np.float64]  # (M,)
+    kappas: NDArray[np.float64]  # (M,)
+
+
+def measure_epoch(minibatches: Sequence[Minibatch], clip_range: float, clip_range_vf: float | None) -> EpochStatistics:
+    """The figures of all minibatches of an epoch at once, with one transfer from the device.
 
     :param minibatches: at least one
+    :param clip_range: PPO's ε
+    :param clip_range_vf: bound of a value head's change, or None
+    """
+    columns = list(zip(*minibatches, strict=True))[:6]
+    log_prob, old_log_prob, advantages, values, old_values, returns = (th.cat(tensors) for tensors in columns)
+    figures = [
+        surrogate_losses(log_prob, old_log_prob, advantages, clip_range),
+        value_errors(values, old_values, returns, clip_range_vf).square(),
+        ((log_prob - old_log_prob).exp() - 1).abs().gt(clip_range).to(log_prob.dtype).unsqueeze(1),
+        kl_estimates(log_prob, old_log_prob).unsqueeze(1),
+    ]
+    means = [part.mean(0) for part in th.cat(figures, 1).split([len(minibatch.log_prob) for minibatch in minibatches])]
+    own = [th.stack([minibatch.entropy_loss, minibatch.kappa]) for minibatch in minibatches]
+    host = th.cat([th.stack(means), th.stack(own)], 1).cpu().numpy().astype(float)
+    n = advantages.shape[1]
+    gramians, weights = (np.array([minibatch[i] for minibatch in minibatches]) for i in (-2, -1))
+    return EpochStatistics(gramians, weights, host[:, :n], host[:, n : 2 * n], *host[:, 2 * n :].T)
+
+
+def summarise(epochs: Sequence[EpochStatistics], spec: RewardSpec) -> tuple[dict[str, float], dict[str, float]]:
+    """Means over all minibatches of an update, by logger key.
+
+    :param epochs: at least one
     :param spec: names the components
     :return: PPO's keys and ours without a component (``approx_kl`` over the last epoch, as in PPO), and those per component
     """
-    gramians = np.array([minibatch.gramian for minibatch in minibatches])
-    clash = conflicts(gramians)
-    weights = np.array([minibatch.weights for minibatch in minibatches])
-    value_losses = np.mean([minibatch.value_losses for minibatch in minibatches], axis=0)
+    update = EpochStatistics(*(np.concatenate(arrays) for arrays in zip(*epochs, strict=True)))
+    clash = conflicts(update.gramians)
+    value_losses = update.value_losses.mean(0)
     n_conflicts = clash.sum((1, 2)).mean() / 2
     n_pairs = max(1, len(spec) * (len(spec) - 1) // 2)
-    last = minibatches[-1].epoch
     scalars = {
-        "train/entropy_loss": np.mean([minibatch.entropy_loss for minibatch in minibatches]),
-        "train/policy_gradient_loss": np.mean([minibatch.weights @ minibatch.policy_losses for minibatch in minibatches]),
+        "train/entropy_loss": update.entropy_losses.mean(),
+        "train/policy_gradient_loss": (update.weights * update.policy_losses).sum(1).mean(),
         "train/value_loss": value_losses.sum(),
-        "train/approx_kl": np.mean([minibatch.approx_kl for minibatch in minibatches if minibatch.epoch == last]),
-        "train/clip_fraction": np.mean([minibatch.clip_fraction for minibatch in minibatches]),
+        "train/approx_kl": epochs[-1].kl.mean(),
+        "train/clip_fraction": update.clip_fractions.mean(),
         "gcr/conflicts": n_conflicts,
         "gcr/conflict_rate": n_conflicts / n_pairs,
-        "gcr/kappa": np.mean([minibatch.kappa for minibatch in minibatches]),
+        "gcr/kappa": update.kappas.mean(),
     }
-    norms = np.sqrt(np.diagonal(gramians, axis1=1, axis2=2)).mean(0)
     by_component = {
-        "gcr/weight": weights.mean(0),
-        "gcr/grad_norm": norms,
+        "gcr/weight": update.weights.mean(0),
+        "gcr/grad_norm": np.sqrt(np.diagonal(update.gramians, axis1=1, axis2=2)).mean(0),
         "gcr/in_conflict": clash.any(2).mean(0),
         "train/value_loss": value_losses,
     }
@@ -73,9 +109,9 @@ def summarise(minibatches: Sequence[MinibatchStatistics], spec: RewardSpec) -> t
     return {key: float(value) for key, value in scalars.items()}, components
 
 
-def mean_cosines(minibatches: Sequence[MinibatchStatistics]) -> NDArray[np.float64]:
+def mean_cosines(epochs: Sequence[EpochStatistics]) -> NDArray[np.float64]:
     """Cosine matrix of the component gradients, mean over the minibatches of an update, shape (K, K)."""
-    return np.asarray(cosines(np.array([minibatch.gramian for minibatch in minibatches])).mean(0))
+    return np.asarray(cosines(np.concatenate([epoch.gramians for epoch in epochs])).mean(0))
 
 
 def component_table(spec: RewardSpec, values: Mapping[str, Any]) -> str:

@@ -18,8 +18,16 @@ from stable_baselines3.common.utils import explained_variance, update_learning_r
 
 from sb3_gcr.advantages import joint_scale, normalize_jointly
 from sb3_gcr.components import GYMNASIUM_ENVS, RewardDecomposition
-from sb3_gcr.diagnostics import MinibatchStatistics, append_cosines, cosine_figure, mean_cosines, summarise
-from sb3_gcr.gradients import ManyBackwards, evaluate_surrogates, value_errors
+from sb3_gcr.diagnostics import (
+    EpochStatistics,
+    Minibatch,
+    append_cosines,
+    cosine_figure,
+    mean_cosines,
+    measure_epoch,
+    summarise,
+)
+from sb3_gcr.gradients import ManyBackwards, kl_estimates, surrogate_cotangents, value_cotangents
 from sb3_gcr.one_backward import OneBackward
 from sb3_gcr.persistent_ppo import PersistentPPO
 from sb3_gcr.resolvers import Resolver, bind_resolver
@@ -181,7 +189,7 @@ class GCRPPO(PersistentPPO):
     def train(self) -> None:
         """Update the policy from the current rollout: the paper's method, minibatch by minibatch.
 
-        :raises ValueError: if a loss or gradient is not finite, before it reaches the weights
+        :raises ValueError: if a gradient is not finite, before it reaches the weights
         """
         self._check_rollout_is_finite()
         if self._is_plain_ppo:
@@ -195,20 +203,23 @@ class GCRPPO(PersistentPPO):
         if self.clip_range_vf is not None:
             clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
         self._networks = self._choose_networks()
-        kappa = self._normalize_rollout()
-        minibatches: list[MinibatchStatistics] = []
+        kappa = th.tensor(self._normalize_rollout(), device=self.device)
+        epochs: list[EpochStatistics] = []
         continue_training = True
-        for epoch in range(self.n_epochs):
+        for _ in range(self.n_epochs):
+            minibatches: list[Minibatch] = []
             for batch in self.rollout_buffer.get(self.batch_size):
-                statistics, continue_training = self._train_minibatch(batch, clip_range, clip_range_vf, len(minibatches) == 0)
-                minibatches.append(statistics._replace(epoch=epoch, kappa=kappa or statistics.kappa))
+                is_first = not (epochs or minibatches)
+                minibatch, continue_training = self._train_minibatch(batch, kappa, clip_range, clip_range_vf, is_first)
+                minibatches.append(minibatch)
                 if not continue_training:
                     break
+            epochs.append(measure_epoch(minibatches, clip_range, clip_range_vf))
             self._n_updates += 1
             if not continue_training:
                 break
         self._n_rollouts_learned += 1
-        self._log_update(minibatches, clip_range, clip_range_vf)
+        self._log_update(epochs, clip_range, clip_range_vf)
 
     def _choose_networks(self) -> OneBackward | ManyBackwards:
         """The cheapest way through the policy that gives the exact Gramian."""
@@ -236,55 +247,59 @@ class GCRPPO(PersistentPPO):
             return None
         return self.advantage_scope or ("rollout" if self.n_objectives > 1 else "minibatch")
 
-    def _normalize_rollout(self) -> float | None:
-        """Normalise the advantages of the whole rollout, if that is the scope, and return κ."""
+    def _normalize_rollout(self) -> float:
+        """Normalise the advantages of the whole rollout, if that is the scope, and return κ, else 1."""
         if self._scope != "rollout":
-            return None
+            return 1.0
         advantages = self.rollout_buffer.advantages
         self.rollout_buffer.advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
         return float(joint_scale(advantages.reshape(-1, self.n_objectives), kappa_max=self.kappa_max))
 
     def _train_minibatch(
-        self, batch: Any, clip_range: float, clip_range_vf: float | None, is_first: bool
-    ) -> tuple[MinibatchStatistics, bool]:
-        """One optimiser step; returns the minibatch's figures and whether ``target_kl`` lets training go on."""
+        self, batch: Any, kappa: th.Tensor, clip_range: float, clip_range_vf: float | None, is_first: bool
+    ) -> tuple[Minibatch, bool]:
+        """One optimiser step; returns what is logged of it and whether ``target_kl`` lets training go on."""
         actions = batch.actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else batch.actions
         networks = self._networks.evaluate(batch.observations, actions)
-        advantages, kappa = batch.advantages, None
+        advantages = batch.advantages
         if self._scope == "minibatch":
             kappa = th.as_tensor(joint_scale(advantages, kappa_max=self.kappa_max), device=advantages.device)
             advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
-        surrogates = evaluate_surrogates(networks.log_prob, batch.old_log_prob, advantages, clip_range)
-        value_losses, value_cotangents = value_errors(networks.values, batch.old_values, batch.returns, clip_range_vf)
-        gramian = networks.gramian(surrogates.cotangents, self.gramian_samples)
-        kappa = th.ones_like(surrogates.kl) if kappa is None else kappa
-        scalars = th.stack([networks.entropy_loss(), surrogates.clip_fraction, surrogates.kl, kappa])
-        host = th.cat([gramian.flatten(), surrogates.losses, value_losses, scalars]).cpu().numpy().astype(float)
-        statistics = self._resolve_minibatch(host)
-        if self.target_kl is not None and statistics.approx_kl > 1.5 * self.target_kl:
-            self.logger.info(f"Early stopping due to reaching max kl: {statistics.approx_kl:.2f}")
-            return statistics, False
+        cotangents = surrogate_cotangents(networks.log_prob, batch.old_log_prob, advantages, clip_range)
+        needed = [networks.gramian(cotangents, self.gramian_samples).flatten()]
+        if self.target_kl is not None or self.desired_kl is not None:
+            needed.append(kl_estimates(networks.log_prob, batch.old_log_prob).mean().unsqueeze(0))
+        n = self.n_objectives
+        host = th.cat(needed).cpu().numpy().astype(float)
+        minibatch = Minibatch(
+            networks.log_prob,
+            batch.old_log_prob,
+            advantages,
+            networks.values,
+            batch.old_values,
+            batch.returns,
+            networks.entropy_loss(),
+            kappa,
+            gramian=host[: n * n].reshape(n, n),
+            weights=np.ones(n),
+        )
+        if not np.isfinite(minibatch.gramian).all():
+            raise ValueError(self._not_finite_message(minibatch, clip_range, clip_range_vf))
+        assert self._resolver_rng is not None
+        minibatch = minibatch._replace(weights=self._weigh(minibatch.gramian, self._resolver_rng))
+        if self.target_kl is not None and host[-1] > 1.5 * self.target_kl:
+            self.logger.info(f"Early stopping due to reaching max kl: {host[-1]:.2f}")
+            return minibatch, False
         if self.desired_kl is not None and not is_first:  # before the first step the KL divergence is 0 and says nothing
-            self._set_learning_rate(adapt_learning_rate(self._learning_rate, statistics.approx_kl, self.desired_kl))
-        weights = th.as_tensor(statistics.weights).to(gramian)
-        networks.backward(surrogates.cotangents @ weights, self.vf_coef * value_cotangents, self.ent_coef)
+            self._set_learning_rate(adapt_learning_rate(self._learning_rate, float(host[-1]), self.desired_kl))
+        weights = th.as_tensor(minibatch.weights, dtype=cotangents.dtype, device=cotangents.device)
+        value_gradients = value_cotangents(networks.values, batch.old_values, batch.returns, clip_range_vf)
+        networks.backward(cotangents @ weights, value_gradients.mul_(self.vf_coef), self.ent_coef)
         norm = networks.clip_gradients(self.max_grad_norm)
         if not np.isfinite(norm):
-            raise ValueError(self._not_finite_message("gradient norm", norm))
+            raise ValueError(self._not_finite_message(minibatch, clip_range, clip_range_vf, norm))
         self.policy.optimizer.step()
-        return statistics, True
-
-    def _resolve_minibatch(self, host: NDArray[np.float64]) -> MinibatchStatistics:
-        """Unpack the one transfer of a minibatch and let the resolver weigh its components."""
-        n = self.n_objectives
-        if not np.isfinite(host).all():
-            names = ["gradient Gramian"] * n * n + [f"{kind} loss" for kind in ("policy", "value") for _ in range(n)]
-            name = [*names, "entropy loss", "clip fraction", "KL divergence", "κ"][int(np.argmin(np.isfinite(host)))]
-            raise ValueError(self._not_finite_message(name, host[~np.isfinite(host)][0]))
-        gramian, losses, scalars = host[: n * n].reshape(n, n), host[n * n : -4].reshape(2, n), host[-4:]
-        assert self._resolver_rng is not None
-        weights = self._weigh(gramian, self._resolver_rng)
-        return MinibatchStatistics(0, gramian, weights, losses[0], losses[1], *scalars)
+        return minibatch, True
 
     def _weigh(self, gramian: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         """Call the resolver and check what it returns."""
@@ -297,10 +312,21 @@ class GCRPPO(PersistentPPO):
             raise ValueError(f"Parameter `resolver` must return finite weights, found {weights}.")
         return weights
 
-    def _not_finite_message(self, name: str, value: float) -> str:
+    def _not_finite_message(
+        self, minibatch: Minibatch, clip_range: float, clip_range_vf: float | None, norm: float = np.inf
+    ) -> str:
+        figures = measure_epoch([minibatch], clip_range, clip_range_vf)
+        by_name = {
+            "gradient Gramian": figures.gramians,
+            "policy loss": figures.policy_losses,
+            "value loss": figures.value_losses,
+            "gradient norm": np.array(norm),
+        }
+        name, found = next((name, found) for name, found in by_name.items() if not np.isfinite(found).all())
         return (
-            f"The {name} must be finite, found {value} in the update at timestep {self.num_timesteps}. The weights are those "
-            "of the last good step; a smaller `learning_rate`, or scaled returns (VecNormalize), may help."
+            f"The {name} must be finite, found {found[~np.isfinite(found)][0]} in the update at timestep "
+            f"{self.num_timesteps}. The weights are those of the last good step; a smaller `learning_rate`, or scaled "
+            "returns (VecNormalize), may help."
         )
 
     @property
@@ -317,18 +343,17 @@ class GCRPPO(PersistentPPO):
         if self.desired_kl is not None and self._adaptive_learning_rate is not None:
             self._set_learning_rate(self._adaptive_learning_rate)
 
-    def _log_update(self, minibatches: list[MinibatchStatistics], clip_range: float, clip_range_vf: float | None) -> None:
+    def _log_update(self, epochs: list[EpochStatistics], clip_range: float, clip_range_vf: float | None) -> None:
         """Record the means over all minibatches of the update under PPO's keys and ours."""
-        scalars, by_component = summarise(minibatches, self.reward_spec)
+        scalars, by_component = summarise(epochs, self.reward_spec)
         values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
         for index, name in enumerate(self.reward_spec.names):
             by_component[f"train/explained_variance/{name}"] = explained_variance(
                 values[..., index].flatten(), returns[..., index].flatten()
             )
-        last = minibatches[-1]
-        scalars["train/loss"] = (
-            last.weights @ last.policy_losses + self.ent_coef * last.entropy_loss + self.vf_coef * last.value_losses.sum()
-        )
+        last = epochs[-1]
+        policy_loss, value_loss = last.weights[-1] @ last.policy_losses[-1], last.value_losses[-1].sum()
+        scalars["train/loss"] = policy_loss + self.ent_coef * last.entropy_losses[-1] + self.vf_coef * value_loss
         scalars["train/explained_variance"] = explained_variance(values.sum(-1).flatten(), returns.sum(-1).flatten())
         if hasattr(self.policy, "log_std"):
             scalars["train/std"] = th.exp(self.policy.log_std).mean().item()
@@ -342,7 +367,7 @@ class GCRPPO(PersistentPPO):
         for key, value in by_component.items():  # SB3's table raises when two keys are cut to the same 36 characters
             self.logger.record(key, value, exclude="stdout")
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self._log_cosines(mean_cosines(minibatches))
+        self._log_cosines(mean_cosines(epochs))
 
     def _log_cosines(self, matrix: NDArray[np.float64]) -> None:
         """Write the cosine matrix to its file, and every few updates to TensorBoard as a picture."""

@@ -7,66 +7,54 @@ c^(k) is all that distinguishes it. The step of any weights w is one backward pa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch as th
 
 
-class Surrogates(NamedTuple):
-    """The K clipped surrogate losses of a minibatch and what follows from the same ratios."""
+def surrogate_losses(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
+    r"""PPO's clipped surrogate loss of each sample and component, to be minimised; one ratio ρ for all components.
 
-    losses: th.Tensor  # (K,)
-    cotangents: th.Tensor  # (B, K)
-    kl: th.Tensor  # ()
-    clip_fraction: th.Tensor  # ()
-
-
-def clipped_surrogates(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
-    r"""PPO's clipped surrogate loss of each component, to be minimised; one ratio ρ for all of them.
-
-    .. math:: L^{(k)} = -\frac{1}{B} \sum_b \min(ρ_b Â_b^{(k)}, \mathrm{clip}(ρ_b, 1-ε, 1+ε) Â_b^{(k)})
+    .. math:: L_b^{(k)} = -\min(ρ_b Â_b^{(k)}, \mathrm{clip}(ρ_b, 1-ε, 1+ε) Â_b^{(k)}), \qquad
+        L^{(k)} = \frac{1}{B} \sum_b L_b^{(k)}
 
     :param log_prob: log π(a_b|s_b) of the current policy, shape (B,)
     :param old_log_prob: the same of the policy that collected the data, shape (B,)
     :param advantages: Â, shape (B, K)
     :param clip_range: ε
-    :return: losses, shape (K,)
+    :return: losses before the mean over samples, shape (B, K)
     """
-    return evaluate_surrogates(log_prob, old_log_prob, advantages, clip_range).losses
+    ratio = (log_prob - old_log_prob).exp().unsqueeze(1)
+    return -th.min(ratio * advantages, ratio.clamp(1 - clip_range, 1 + clip_range) * advantages)
 
 
-def evaluate_surrogates(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> Surrogates:
-    r"""The losses of :func:`clipped_surrogates` with their derivatives by log π in closed form.
+def surrogate_cotangents(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
+    r"""The derivatives of the mean :func:`surrogate_losses` by log π in closed form: all that an update needs of them.
 
-    .. math:: c_b^{(k)} = \frac{∂L^{(k)}}{∂\log π_b} = -\frac{ρ_b Â_b^{(k)}}{B} \text{ where not clipped, else } 0, \qquad
-        KL ≈ \frac{1}{B} \sum_b (ρ_b - 1) - \log ρ_b
+    .. math:: c_b^{(k)} = \frac{∂L^{(k)}}{∂\log π_b} = -\frac{ρ_b Â_b^{(k)}}{B} \text{ where not clipped, else } 0
 
     :param log_prob: log π(a_b|s_b), shape (B,)
     :param old_log_prob: shape (B,)
     :param advantages: Â, shape (B, K)
     :param clip_range: ε
-    :return: losses L, cotangents c, KL(old ‖ current), and the share of samples with abs(ρ - 1) > ε, both as in SB3's PPO
+    :return: cotangents c, shape (B, K)
     """
+    ratio = (log_prob - old_log_prob).exp_().unsqueeze(1)
+    unclipped = ratio * advantages
+    clipped = ratio.clamp_(1 - clip_range, 1 + clip_range) * advantages
+    return th.where(unclipped > clipped, 0.0, unclipped).div_(-len(advantages))
+
+
+def kl_estimates(log_prob: th.Tensor, old_log_prob: th.Tensor) -> th.Tensor:
+    """Each sample's term (ρ - 1) - log ρ of the estimate of KL(old ‖ current) that SB3's PPO logs, shape (B,)."""
     log_ratio = log_prob - old_log_prob
-    ratio = log_ratio.exp()
-    column = ratio.unsqueeze(1)
-    unclipped = column * advantages
-    clipped = column.clamp(1 - clip_range, 1 + clip_range) * advantages
-    excess = ratio - 1
-    return Surrogates(
-        losses=-th.min(unclipped, clipped).mean(0),
-        cotangents=th.where(unclipped <= clipped, unclipped, 0.0) / -len(advantages),
-        kl=(excess - log_ratio).mean(),
-        clip_fraction=(excess.abs() > clip_range).to(ratio.dtype).mean(),
-    )
+    return log_ratio.exp() - 1 - log_ratio
 
 
-def value_errors(
-    values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range_vf: float | None
-) -> tuple[th.Tensor, th.Tensor]:
-    r"""Mean squared error of each value head and its derivative; the change of a head is clipped as in SB3's PPO.
+def value_errors(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range_vf: float | None) -> th.Tensor:
+    r"""Error of each value head at each sample; the change of a head is clipped as in SB3's PPO.
 
-    .. math:: L_V^{(k)} = \frac{1}{B} \sum_b (V_b^{(k)} - Ĝ_b^{(k)})^2
+    .. math:: L_V^{(k)} = \frac{1}{B} \sum_b e_b^{(k)\,2}, \qquad e_b^{(k)} = V_b^{(k)} - Ĝ_b^{(k)}
 
     with V replaced by V_old + clip(V - V_old, -c, c) if a ``clip_range_vf`` c is given.
 
@@ -74,15 +62,26 @@ def value_errors(
     :param old_values: V when the data were collected, shape (B, K)
     :param returns: Ĝ, shape (B, K)
     :param clip_range_vf: c in units of the return, or None
-    :return: losses, shape (K,), and cotangents ∂L_V^(k)/∂V_b^(k), shape (B, K)
+    :return: e, shape (B, K)
     """
-    if clip_range_vf is None:
-        error = values - returns
-        return (error * error).mean(0), error * (2 / len(values))
-    change = values - old_values
-    error = old_values + change.clamp(-clip_range_vf, clip_range_vf) - returns
-    free = change.abs() <= clip_range_vf
-    return (error * error).mean(0), th.where(free, error, 0.0) * (2 / len(values))
+    if clip_range_vf is not None:
+        values = old_values + (values - old_values).clamp(-clip_range_vf, clip_range_vf)
+    return values - returns
+
+
+def value_cotangents(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range_vf: float | None) -> th.Tensor:
+    r"""The derivatives ∂L_V^(k)/∂V_b^(k) = 2 e_b^(k) / B of the losses of :func:`value_errors`, 0 where clipped.
+
+    :param values: V, shape (B, K)
+    :param old_values: V when the data were collected, shape (B, K)
+    :param returns: Ĝ, shape (B, K)
+    :param clip_range_vf: c in units of the return, or None
+    :return: cotangents, shape (B, K)
+    """
+    errors = value_errors(values, old_values, returns, clip_range_vf)
+    if clip_range_vf is not None:
+        errors = th.where((values - old_values).abs() > clip_range_vf, 0.0, errors)
+    return errors.mul_(2 / len(values))
 
 
 def gramian_by_passes(log_prob: th.Tensor, cotangents: th.Tensor, parameters: Sequence[th.nn.Parameter]) -> th.Tensor:

@@ -12,6 +12,7 @@ small networks most of the time of an update is PyTorch's bookkeeping, not arith
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
@@ -321,7 +322,7 @@ class OneBackward:
 
     def clip_gradients(self, max_norm: float) -> float:
         """Scale all gradients down to a joint norm of at most ``max_norm``, as ``clip_grad_norm_``; the norm before."""
-        norm = self._flat.norm().item()
+        norm = math.sqrt(th.dot(self._flat, self._flat).item())
         if norm > max_norm:
             self._flat.mul_(max_norm / (norm + 1e-6))
         return norm
@@ -357,20 +358,29 @@ def layer_gramian(signals: list[th.Tensor], inputs: list[th.Tensor], added: th.T
 def _gramian_by_samples(layers: list[tuple[th.Tensor, th.Tensor]], cotangents: th.Tensor) -> th.Tensor:
     """Cᵀ M C with M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ), by blocks of rows; of the symmetric M only the upper half."""
     n_samples, n_objectives = cotangents.shape
-    gramian = cotangents.new_zeros(n_objectives, n_objectives)
-    height = n_samples if n_samples <= WHOLE else min(HIGHEST, max(LOWEST, n_samples // 4))
+    if n_samples <= WHOLE:
+        return _rows_by_samples(layers, cotangents, slice(None), slice(None)).mm(cotangents)
+    half = cotangents.new_zeros(n_objectives, n_objectives)
+    height = min(HIGHEST, max(LOWEST, n_samples // 4))
     for start in range(0, n_samples, height):
         rows, columns = slice(start, start + height), slice(start, n_samples)
-        block: th.Tensor | None = None
-        for signal, features in layers:
-            products = th.mm(signal[rows], signal[columns].T)
-            overlaps = th.mm(features[rows], features[columns].T)
-            block = products.mul_(overlaps) if block is None else block.addcmul_(products, overlaps)
-        assert block is not None
-        left = th.mm(cotangents[rows].T, block)  # few rows: much faster than few columns, (block @ cotangents)
-        left[:, :height].mul_(0.5)  # the transposed half adds the rest of the symmetric square on the diagonal
-        gramian.addmm_(left, cotangents[columns])
-    return gramian + gramian.T
+        left = _rows_by_samples(layers, cotangents, rows, columns)
+        left[:, :height].mul_(0.5)  # the square on the diagonal is symmetric itself
+        half.addmm_(left, cotangents[columns])
+    return half + half.T
+
+
+def _rows_by_samples(
+    layers: list[tuple[th.Tensor, th.Tensor]], cotangents: th.Tensor, rows: slice, columns: slice
+) -> th.Tensor:
+    """Cᵀ M with a block of M's rows and columns: much faster than M C, which has K columns instead of K rows."""
+    block: th.Tensor | None = None
+    for signal, features in layers:
+        products = th.mm(signal[rows], signal[columns].T)
+        overlaps = th.mm(features[rows], features[columns].T)
+        block = products.mul_(overlaps) if block is None else block.addcmul_(products, overlaps)
+    assert block is not None
+    return th.mm(cotangents[rows].T, block)
 
 
 def _gramian_by_weights(signal: th.Tensor, features: th.Tensor, cotangents: th.Tensor) -> th.Tensor:

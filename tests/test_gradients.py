@@ -13,9 +13,10 @@ from torch import nn
 
 from sb3_gcr.gradients import (
     ManyBackwards,
-    clipped_surrogates,
-    evaluate_surrogates,
     gramian_by_passes,
+    surrogate_cotangents,
+    surrogate_losses,
+    value_cotangents,
     value_errors,
 )
 from sb3_gcr.one_backward import ACTIVATIONS, OneBackward, layer_gramian
@@ -41,25 +42,32 @@ B, K = 24, 5
 def test_surrogate_by_hand(ratio: float, advantage: float, loss: float, slope: float) -> None:
     log_prob, old = th.tensor([np.log(ratio)]), th.zeros(1)
     advantages = th.tensor([[advantage]], dtype=th.double)
-    assert clipped_surrogates(log_prob, old, advantages, 0.2).item() == pytest.approx(loss)
-    assert evaluate_surrogates(log_prob, old, advantages, 0.2).cotangents.item() == pytest.approx(slope)
+    assert surrogate_losses(log_prob, old, advantages, 0.2).item() == pytest.approx(loss)
+    assert surrogate_cotangents(log_prob.detach(), old, advantages, 0.2).item() == pytest.approx(slope)
 
 
 def test_cotangents_are_the_derivative_of_the_surrogates() -> None:
     th.manual_seed(0)
     log_prob = (0.4 * th.randn(B, dtype=th.double)).requires_grad_()
     old, advantages = 0.4 * th.randn(B, dtype=th.double), th.randn(B, K, dtype=th.double)
-    losses = clipped_surrogates(log_prob, old, advantages, 0.2)
+    losses = surrogate_losses(log_prob, old, advantages, 0.2).mean(0)
     for k in range(K):
         (expected,) = th.autograd.grad(losses[k], log_prob, retain_graph=True)
-        th.testing.assert_close(evaluate_surrogates(log_prob, old, advantages, 0.2).cotangents[:, k], expected)
+        th.testing.assert_close(surrogate_cotangents(log_prob.detach(), old, advantages, 0.2)[:, k], expected)
+
+
+def test_nan_is_not_clipped_away() -> None:
+    nan, one = th.full((1, 1), th.nan), th.ones(1, 1)
+    assert surrogate_cotangents(nan[0], one[0], one, 0.2).isnan().all()
+    assert surrogate_cotangents(one[0], one[0], nan, 0.2).isnan().all()
+    assert value_cotangents(nan, one, one, 0.2).isnan().all()
 
 
 def test_the_sum_of_clipped_surrogates_is_never_below_the_joint_one() -> None:
     th.manual_seed(1)
     log_prob, advantages = 0.5 * th.randn(200), th.randn(200, K)
-    joint = clipped_surrogates(log_prob, th.zeros(200), advantages.sum(1, keepdim=True), 0.2)
-    assert clipped_surrogates(log_prob, th.zeros(200), advantages, 0.2).sum() > joint.sum()
+    joint = surrogate_losses(log_prob, th.zeros(200), advantages.sum(1, keepdim=True), 0.2)
+    assert surrogate_losses(log_prob, th.zeros(200), advantages, 0.2).sum() > joint.sum()
 
 
 @pytest.mark.parametrize("clip_range_vf", [None, 0.3])
@@ -69,8 +77,9 @@ def test_value_errors_against_autograd(clip_range_vf: float | None) -> None:
     old, returns = values.detach() + 0.4 * th.randn(B, K), th.randn(B, K)
     predicted = values if clip_range_vf is None else old + (values - old).clamp(-clip_range_vf, clip_range_vf)
     expected = ((predicted - returns) ** 2).mean(0)
-    losses, cotangents = value_errors(values.detach(), old, returns, clip_range_vf)
-    th.testing.assert_close(losses, expected.detach())
+    arguments = (values.detach(), old, returns, clip_range_vf)
+    cotangents = value_cotangents(*arguments)
+    th.testing.assert_close(value_errors(*arguments).square().mean(0), expected.detach())
     th.testing.assert_close(cotangents, th.autograd.grad(expected.sum(), values)[0])
 
 

@@ -26,7 +26,7 @@ ARROWS = {
     "optimisers": set(),
     "policies": {"optimisers"},
     "buffers": {"advantages"},
-    "diagnostics": {"components", "resolvers"},
+    "diagnostics": {"components", "gradients", "resolvers"},
     "evaluation": {"components"},
     "report": {"components", "diagnostics"},
     "vector_ppo": {"advantages", "buffers", "components", "diagnostics", "policies"},
