@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 COSINES_FILE = "cosines.csv"
 
 
-class Minibatch(NamedTuple):
-    """What one minibatch of B samples and K components leaves for the log: tensors as they are, arrays on the host."""
+class Samples(NamedTuple):
+    """The B samples of a minibatch, as the log needs them: on the device; K components."""
 
     log_prob: th.Tensor  # (B,)
     old_log_prob: th.Tensor  # (B,)
@@ -33,6 +33,12 @@ class Minibatch(NamedTuple):
     returns: th.Tensor  # (B, K)
     entropy_loss: th.Tensor  # ()
     kappa: th.Tensor  # ()
+
+
+class Minibatch(NamedTuple):
+    """A minibatch and how its gradients were resolved, on the host."""
+
+    samples: Samples
     gramian: NDArray[np.float64]  # (K, K)
     weights: NDArray[np.float64]  # (K,)
 
@@ -57,7 +63,8 @@ def measure_epoch(minibatches: Sequence[Minibatch], clip_range: float, clip_rang
     :param clip_range: PPO's ε
     :param clip_range_vf: bound of a value head's change, or None
     """
-    columns = list(zip(*minibatches, strict=True))[:6]
+    samples, gramians, weights = zip(*minibatches, strict=True)
+    *columns, entropy_losses, kappas = zip(*samples, strict=True)
     log_prob, old_log_prob, advantages, values, old_values, returns = (th.cat(tensors) for tensors in columns)
     figures = [
         surrogate_losses(log_prob, old_log_prob, advantages, clip_range),
@@ -65,12 +72,11 @@ def measure_epoch(minibatches: Sequence[Minibatch], clip_range: float, clip_rang
         ((log_prob - old_log_prob).exp() - 1).abs().gt(clip_range).to(log_prob.dtype).unsqueeze(1),
         kl_estimates(log_prob, old_log_prob).unsqueeze(1),
     ]
-    means = [part.mean(0) for part in th.cat(figures, 1).split([len(minibatch.log_prob) for minibatch in minibatches])]
-    own = [th.stack([minibatch.entropy_loss, minibatch.kappa]) for minibatch in minibatches]
-    host = th.cat([th.stack(means), th.stack(own)], 1).cpu().numpy().astype(float)
+    sizes = th.tensor([len(tensor) for tensor in columns[0]], device=log_prob.device)
+    means = th.segment_reduce(th.cat(figures, 1), "mean", lengths=sizes)
+    host = th.column_stack([means, th.stack(entropy_losses), th.stack(kappas)]).cpu().numpy().astype(float)
     n = advantages.shape[1]
-    gramians, weights = (np.array([minibatch[i] for minibatch in minibatches]) for i in (-2, -1))
-    return EpochStatistics(gramians, weights, host[:, :n], host[:, n : 2 * n], *host[:, 2 * n :].T)
+    return EpochStatistics(np.array(gramians), np.array(weights), host[:, :n], host[:, n : 2 * n], *host[:, 2 * n :].T)
 
 
 def summarise(epochs: Sequence[EpochStatistics], spec: RewardSpec) -> tuple[dict[str, float], dict[str, float]]:

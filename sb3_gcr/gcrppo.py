@@ -21,6 +21,7 @@ from sb3_gcr.components import GYMNASIUM_ENVS, RewardDecomposition
 from sb3_gcr.diagnostics import (
     EpochStatistics,
     Minibatch,
+    Samples,
     append_cosines,
     cosine_figure,
     mean_cosines,
@@ -271,28 +272,19 @@ class GCRPPO(PersistentPPO):
             needed.append(kl_estimates(networks.log_prob, batch.old_log_prob).mean().unsqueeze(0))
         n = self.n_objectives
         host = th.cat(needed).cpu().numpy().astype(float)
-        minibatch = Minibatch(
-            networks.log_prob,
-            batch.old_log_prob,
-            advantages,
-            networks.values,
-            batch.old_values,
-            batch.returns,
-            networks.entropy_loss(),
-            kappa,
-            gramian=host[: n * n].reshape(n, n),
-            weights=np.ones(n),
-        )
-        if not np.isfinite(minibatch.gramian).all():
-            raise ValueError(self._not_finite_message(minibatch, clip_range, clip_range_vf))
+        gramian = host[: n * n].reshape(n, n)
+        tensors = networks.log_prob, batch.old_log_prob, advantages, networks.values, batch.old_values, batch.returns
+        samples = Samples(*tensors, networks.entropy_loss(), kappa)
+        if not np.isfinite(gramian).all():
+            raise ValueError(self._not_finite_message(Minibatch(samples, gramian, np.ones(n)), clip_range, clip_range_vf))
         assert self._resolver_rng is not None
-        minibatch = minibatch._replace(weights=self._weigh(minibatch.gramian, self._resolver_rng))
+        minibatch = Minibatch(samples, gramian, self._weigh(gramian, self._resolver_rng))
         if self.target_kl is not None and host[-1] > 1.5 * self.target_kl:
             self.logger.info(f"Early stopping due to reaching max kl: {host[-1]:.2f}")
             return minibatch, False
         if self.desired_kl is not None and not is_first:  # before the first step the KL divergence is 0 and says nothing
             self._set_learning_rate(adapt_learning_rate(self._learning_rate, float(host[-1]), self.desired_kl))
-        weights = th.as_tensor(minibatch.weights, dtype=cotangents.dtype, device=cotangents.device)
+        weights = th.from_numpy(minibatch.weights.astype(np.float32)).to(cotangents)
         value_gradients = value_cotangents(networks.values, batch.old_values, batch.returns, clip_range_vf)
         networks.backward(cotangents @ weights, value_gradients.mul_(self.vf_coef), self.ent_coef)
         norm = networks.clip_gradients(self.max_grad_norm)

@@ -42,7 +42,7 @@ def surrogate_cotangents(log_prob: th.Tensor, old_log_prob: th.Tensor, advantage
     ratio = (log_prob - old_log_prob).exp_().unsqueeze(1)
     unclipped = ratio * advantages
     clipped = ratio.clamp_(1 - clip_range, 1 + clip_range) * advantages
-    return th.where(unclipped > clipped, 0.0, unclipped).div_(-len(advantages))
+    return unclipped.masked_fill_(unclipped > clipped, 0.0).div_(-len(advantages))
 
 
 def kl_estimates(log_prob: th.Tensor, old_log_prob: th.Tensor) -> th.Tensor:

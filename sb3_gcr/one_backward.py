@@ -29,6 +29,7 @@ from stable_baselines3.common.distributions import (
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, MlpExtractor
 from torch import nn
+from torch.nn.functional import linear
 
 #: Numbers that a block of K weight gradients may hold at a time, on the CPU and on other devices.
 BLOCK, BLOCK_ON_DEVICE = 2**22, 2**26
@@ -128,9 +129,9 @@ class Mlp:
         """Output for features of shape (B, in); each layer's input H is kept."""
         self.inputs = [features]
         for weight, bias, activation in zip(self.weights, self.biases, self.activations, strict=False):
-            features = activation.forward(th.addmm(bias, features, weight.T))
+            features = activation.forward(linear(features, weight, bias))
             self.inputs.append(features)
-        return th.addmm(self.biases[-1], features, self.weights[-1].T)
+        return linear(features, self.weights[-1], self.biases[-1])
 
     def signals(self, cotangent: th.Tensor) -> list[th.Tensor]:
         """The signal Δ of shape (B, out) at each layer's output, for a cotangent of the last one."""
@@ -153,6 +154,7 @@ class GaussianHead:
 
     def __init__(self, policy: Any):
         self.log_std = policy.log_std
+        self._ones = th.ones_like(policy.log_std)
 
     def forward(self, mean: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return log π(a|s) = -½ Σ ((a - μ) / σ)² - Σ log σ - ½ A log 2π, shape (B,)."""
@@ -160,7 +162,7 @@ class GaussianHead:
         self._z = (actions - mean) * self._scale
         self._squares = self._z * self._z
         self._log_det = self.log_std.sum() + 0.5 * _LOG_2PI * mean.shape[1]
-        return self._squares.sum(1).mul_(-0.5) - self._log_det
+        return th.addmv(self._log_det, self._squares, self._ones, beta=-1, alpha=-0.5)
 
     def signal(self) -> th.Tensor:
         """Return ∂log π/∂μ = (a - μ) / σ², shape (B, A)."""
@@ -172,7 +174,7 @@ class GaussianHead:
 
     def entropy_loss(self) -> th.Tensor:
         """Minus the entropy Σ log σ + ½ A (1 + log 2π)."""
-        return -(self._log_det + 0.5 * self.log_std.numel())
+        return -0.5 * self.log_std.numel() - self._log_det
 
     def entropy_signal(self) -> None:
         """The entropy does not depend on the mean."""
@@ -286,12 +288,11 @@ class OneBackward:
         """
         signals = self.actor.signals(self.head.signal())
         self._added = th.cat([*signals, *self.head.score()], 1)  # ∂log π/∂bias of all layers, and S
-        return layer_gramian(
-            [signal[:n_samples] for signal in signals],
-            [features[:n_samples] for features in self.actor.inputs],
-            self._added[:n_samples],
-            cotangents[:n_samples],
-        )
+        inputs, added = self.actor.inputs, self._added
+        if n_samples is not None:
+            signals, inputs = ([tensor[:n_samples] for tensor in tensors] for tensors in (signals, inputs))
+            added, cotangents = added[:n_samples], cotangents[:n_samples]
+        return layer_gramian(signals, inputs, added, cotangents)
 
     def entropy_loss(self) -> th.Tensor:
         """PPO's entropy loss: minus the mean entropy."""
@@ -359,28 +360,30 @@ def _gramian_by_samples(layers: list[tuple[th.Tensor, th.Tensor]], cotangents: t
     """Cᵀ M C with M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ), by blocks of rows; of the symmetric M only the upper half."""
     n_samples, n_objectives = cotangents.shape
     if n_samples <= WHOLE:
-        return _rows_by_samples(layers, cotangents, slice(None), slice(None)).mm(cotangents)
+        return _rows_of_products([(s, s, h, h) for s, h in layers], cotangents).mm(cotangents)
     half = cotangents.new_zeros(n_objectives, n_objectives)
     height = min(HIGHEST, max(LOWEST, n_samples // 4))
     for start in range(0, n_samples, height):
         rows, columns = slice(start, start + height), slice(start, n_samples)
-        left = _rows_by_samples(layers, cotangents, rows, columns)
+        left = _rows_of_products([(s[rows], s[columns], h[rows], h[columns]) for s, h in layers], cotangents[rows])
         left[:, :height].mul_(0.5)  # the square on the diagonal is symmetric itself
         half.addmm_(left, cotangents[columns])
     return half + half.T
 
 
-def _rows_by_samples(
-    layers: list[tuple[th.Tensor, th.Tensor]], cotangents: th.Tensor, rows: slice, columns: slice
-) -> th.Tensor:
-    """Cᵀ M with a block of M's rows and columns: much faster than M C, which has K columns instead of K rows."""
+def _rows_of_products(layers: list[tuple[th.Tensor, ...]], cotangents: th.Tensor) -> th.Tensor:
+    """Cᵀ M for a block of M's rows and columns: much faster than M C, which has K columns instead of K rows.
+
+    :param layers: Δ and H of each layer, in the block's rows and columns: (Δ_rows, Δ_columns, H_rows, H_columns)
+    :param cotangents: C in the block's rows
+    """
     block: th.Tensor | None = None
-    for signal, features in layers:
-        products = th.mm(signal[rows], signal[columns].T)
-        overlaps = th.mm(features[rows], features[columns].T)
+    for signal, other_signal, features, other_features in layers:
+        products = th.mm(signal, other_signal.T)
+        overlaps = th.mm(features, other_features.T)
         block = products.mul_(overlaps) if block is None else block.addcmul_(products, overlaps)
     assert block is not None
-    return th.mm(cotangents[rows].T, block)
+    return th.mm(cotangents.T, block)
 
 
 def _gramian_by_weights(signal: th.Tensor, features: th.Tensor, cotangents: th.Tensor) -> th.Tensor:
