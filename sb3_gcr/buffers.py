@@ -96,9 +96,12 @@ class VectorRolloutBuffer(RolloutBuffer):
         for name, tensor in self._tensors.items():
             _each(tensor, partial(_gather, indices), self._shuffled[name])
         batch_size = batch_size or n_samples
-        for start in range(0, n_samples, batch_size):
-            batch = itemgetter(slice(start, start + batch_size))
-            yield self._samples_class(**{name: _each(tensor, batch) for name, tensor in self._shuffled.items()})
+        parts = {
+            name: _each(tensor, partial(th.split, split_size_or_sections=batch_size))
+            for name, tensor in self._shuffled.items()
+        }
+        for index in range(-(-n_samples // batch_size)):
+            yield self._samples_class(**{name: _each(tensors, itemgetter(index)) for name, tensors in parts.items()})
 
     def _to_samples(self, array: Any) -> Any:
         return self.to_torch(self.swap_and_flatten(array), copy=False)

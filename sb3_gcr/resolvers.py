@@ -23,7 +23,7 @@ Resolver = Callable[[Array, Levels, np.random.Generator], Array]
 #: Two gradients conflict when ⟨g_i, g_j⟩ is below minus this share of |g_i| |g_j|: rounding is no conflict.
 TOLERANCE = 1e-12
 #: Up to so many components the projections run row by row.
-FEW = 14
+FEW = 11
 #: A component whose squared gradient norm is below this share of the largest one has no gradient.
 ZERO_ROW = 1e-40
 #: Eigenvalues of a Gramian of unit gradients below this share of the largest are rounding.
@@ -105,15 +105,18 @@ def _project_row_by_row(directions: Array, norms: Array, levels: Levels, order: 
 
 def _project_rows_together(directions: Array, norms: Array, levels: Levels, order: NDArray[np.intp]) -> Array:
     """Weights of :func:`gcr`, all components meeting their next one at the same time."""
-    each = np.arange(len(norms))
-    yields = (levels[:, None] >= levels) & (each[:, None] != each)
-    inner, removed = directions.copy(), np.zeros_like(directions)
-    for met in order.T:
-        cosine = inner[each, met]
-        cosine = np.where((cosine < -TOLERANCE) & yields[each, met], cosine, 0.0)
-        inner -= cosine[:, None] * directions[met]
-        removed[each, met] = cosine
-    return 1 - np.divide(norms @ removed, norms, out=np.zeros_like(norms), where=norms > 0)
+    n = len(norms)
+    each = np.arange(n)[:, None]
+    yields = (levels[:, None] >= levels[order]) & (order != each)
+    inner, removed = directions.copy(), []
+    steps = zip(directions[order.T], (order + n * each).T, np.where(yields, -TOLERANCE, -np.inf).T, strict=True)
+    for met, places, threshold in steps:  # of each component's next one: its cosines, ⟨g_i', g_j⟩, below which it is met
+        cosine = inner.take(places)
+        cosine *= cosine < threshold
+        inner -= cosine[:, None] * met
+        removed.append(cosine * norms)
+    total = np.bincount(order.T.ravel(), np.concatenate(removed), n)
+    return 1 - np.divide(total, norms, out=np.zeros_like(norms), where=norms > 0)
 
 
 def no_priority(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
