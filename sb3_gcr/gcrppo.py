@@ -204,7 +204,7 @@ class GCRPPO(PersistentPPO):
         if self.clip_range_vf is not None:
             clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
         self._networks = self._choose_networks()
-        kappa = th.tensor(self._normalize_rollout(), device=self.device)
+        kappa = self._normalize_rollout()
         epochs: list[EpochStatistics] = []
         continue_training = True
         for _ in range(self.n_epochs):
@@ -248,30 +248,33 @@ class GCRPPO(PersistentPPO):
             return None
         return self.advantage_scope or ("rollout" if self.n_objectives > 1 else "minibatch")
 
-    def _normalize_rollout(self) -> float:
-        """Normalise the advantages of the whole rollout, if that is the scope, and return κ, else 1."""
-        if self._scope != "rollout":
-            return 1.0
-        advantages = self.rollout_buffer.advantages
-        self.rollout_buffer.advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
-        return float(joint_scale(advantages.reshape(-1, self.n_objectives), kappa_max=self.kappa_max))
+    def _normalize_rollout(self) -> th.Tensor | None:
+        """Normalise the whole rollout's advantages, if that is the scope, and return κ; None if minibatches have theirs."""
+        if self._scope == "minibatch":
+            return None
+        kappa = 1.0
+        if self._scope == "rollout":
+            advantages = self.rollout_buffer.advantages
+            kappa = joint_scale(advantages.reshape(-1, self.n_objectives), kappa_max=self.kappa_max)
+            self.rollout_buffer.advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
+        return th.tensor(kappa, dtype=th.float32, device=self.device)
 
     def _train_minibatch(
-        self, batch: Any, kappa: th.Tensor, clip_range: float, clip_range_vf: float | None, is_first: bool
+        self, batch: Any, kappa: th.Tensor | None, clip_range: float, clip_range_vf: float | None, is_first: bool
     ) -> tuple[Minibatch, bool]:
         """One optimiser step; returns what is logged of it and whether ``target_kl`` lets training go on."""
         actions = batch.actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else batch.actions
         networks = self._networks.evaluate(batch.observations, actions)
         advantages = batch.advantages
-        if self._scope == "minibatch":
+        if kappa is None:
             kappa = th.as_tensor(joint_scale(advantages, kappa_max=self.kappa_max), device=advantages.device)
             advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
         cotangents = surrogate_cotangents(networks.log_prob, batch.old_log_prob, advantages, clip_range)
-        needed = [networks.gramian(cotangents, self.gramian_samples).flatten()]
+        needed = networks.gramian(cotangents, self.gramian_samples).flatten()
         if self.target_kl is not None or self.desired_kl is not None:
-            needed.append(kl_estimates(networks.log_prob, batch.old_log_prob).mean().unsqueeze(0))
+            needed = th.cat([needed, kl_estimates(networks.log_prob, batch.old_log_prob).mean().unsqueeze(0)])
         n = self.n_objectives
-        host = th.cat(needed).cpu().numpy().astype(float)
+        host = needed.cpu().numpy().astype(float)
         gramian = host[: n * n].reshape(n, n)
         tensors = networks.log_prob, batch.old_log_prob, advantages, networks.values, batch.old_values, batch.returns
         samples = Samples(*tensors, networks.entropy_loss(), kappa)

@@ -47,12 +47,13 @@ def cosines(gramian: Array) -> Array:
     :param gramian: G, shape (..., K, K)
     :return: shape (..., K, K)
     """
-    scale = _products_of_norms(gramian)
-    return np.divide(gramian, scale, out=np.zeros_like(gramian), where=scale > 0)
+    return np.asarray(gramian / _products_of_norms(gramian))
 
 
 def _products_of_norms(gramian: Array) -> Array:
-    norms = np.sqrt(np.diagonal(gramian, axis1=-2, axis2=-1))
+    """|g_i| |g_j|, shape (..., K, K); infinite where one of them vanishes, so that it has no direction and no conflicts."""
+    norms = np.sqrt(gramian.diagonal(0, -2, -1))
+    norms = np.where(norms > 0, norms, np.inf)
     return np.asarray(norms[..., :, None] * norms[..., None, :])
 
 
