@@ -23,15 +23,15 @@ COSINES_FILE = "cosines.csv"
 
 
 class Samples(NamedTuple):
-    """The B samples of a minibatch, as the log needs them: on the device; K components."""
+    """The B samples of a minibatch, as the log needs them: NumPy arrays or tensors; K components."""
 
-    log_prob: th.Tensor  # (B,)
-    old_log_prob: th.Tensor  # (B,)
-    advantages: th.Tensor  # (B, K)
-    values: th.Tensor  # (B, K)
-    old_values: th.Tensor  # (B, K)
-    returns: th.Tensor  # (B, K)
-    entropy_loss: th.Tensor  # ()
+    log_prob: Any  # (B,)
+    old_log_prob: Any  # (B,)
+    advantages: Any  # (B, K)
+    values: Any  # (B, K)
+    old_values: Any  # (B, K)
+    returns: Any  # (B, K)
+    entropy_loss: Any  # ()
     kappa: th.Tensor  # ()
 
 
@@ -65,18 +65,24 @@ def measure_epoch(minibatches: Sequence[Minibatch], clip_range: float, clip_rang
     """
     samples, gramians, weights = zip(*minibatches, strict=True)
     *columns, entropy_losses, kappas = zip(*samples, strict=True)
-    log_prob, old_log_prob, advantages, values, old_values, returns = (th.cat(tensors) for tensors in columns)
+    log_prob, old_log_prob, advantages, values, old_values, returns = map(join, columns)
     figures = [
         surrogate_losses(log_prob, old_log_prob, advantages, clip_range),
         value_errors(values, old_values, returns, clip_range_vf).square(),
         ((log_prob - old_log_prob).exp() - 1).abs().gt(clip_range).to(log_prob.dtype).unsqueeze(1),
         kl_estimates(log_prob, old_log_prob).unsqueeze(1),
     ]
-    sizes = th.tensor([len(tensor) for tensor in columns[0]], device=log_prob.device)
+    sizes = th.tensor([len(array) for array in columns[0]], device=log_prob.device)
     means = th.segment_reduce(th.cat(figures, 1), "mean", lengths=sizes)
-    host = th.column_stack([means, th.stack(entropy_losses), th.stack(kappas)]).cpu().numpy().astype(float)
+    own = [join([scalar.reshape(1) for scalar in scalars]) for scalars in (entropy_losses, kappas)]
+    host = th.column_stack([means, *own]).cpu().numpy().astype(float)
     n = advantages.shape[1]
     return EpochStatistics(np.array(gramians), np.array(weights), host[:, :n], host[:, n : 2 * n], *host[:, 2 * n :].T)
+
+
+def join(arrays: Sequence[Any]) -> th.Tensor:
+    """One tensor of several, or of several NumPy arrays, along the first axis."""
+    return th.cat(list(arrays)) if isinstance(arrays[0], th.Tensor) else th.from_numpy(np.concatenate(arrays))
 
 
 def summarise(epochs: Sequence[EpochStatistics], spec: RewardSpec) -> tuple[dict[str, float], dict[str, float]]:

@@ -24,6 +24,7 @@ from sb3_gcr.diagnostics import (
     Samples,
     append_cosines,
     cosine_figure,
+    join,
     mean_cosines,
     measure_epoch,
     summarise,
@@ -187,6 +188,7 @@ class GCRPPO(PersistentPPO):
         return result
 
     @th.no_grad()
+    @np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused with an error of its own
     def train(self) -> None:
         """Update the policy from the current rollout: the paper's method, minibatch by minibatch.
 
@@ -231,7 +233,9 @@ class GCRPPO(PersistentPPO):
                 "actor and a critic of linear layers and common activations, a flat features extractor and no gSDE."
             )
         self.logger.record("gcr/one_backward", int(fits and self.gramian_method != "passes"))
-        return ManyBackwards(self.policy) if self.gramian_method == "passes" or not fits else OneBackward(self.policy)
+        if self.gramian_method == "passes" or not fits:
+            return ManyBackwards(self.policy)
+        return OneBackward(self.policy, self.batch_size)
 
     def _check_rollout_is_finite(self) -> None:
         """Refuse a rollout with NaN or infinity, which rewards, observations or the networks may have brought in."""
@@ -265,19 +269,20 @@ class GCRPPO(PersistentPPO):
         """One optimiser step; returns what is logged of it and whether ``target_kl`` lets training go on."""
         actions = batch.actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else batch.actions
         networks = self._networks.evaluate(batch.observations, actions)
-        advantages = batch.advantages
+        tensors = batch.old_log_prob, batch.old_values, batch.returns, batch.advantages
+        old_log_prob, old_values, returns, advantages = (networks.array(tensor) for tensor in tensors)
         if kappa is None:
-            kappa = th.as_tensor(joint_scale(advantages, kappa_max=self.kappa_max), device=advantages.device)
+            kappa = th.as_tensor(joint_scale(advantages, kappa_max=self.kappa_max), device=self.device)
             advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
-        cotangents = surrogate_cotangents(networks.log_prob, batch.old_log_prob, advantages, clip_range)
-        needed = networks.gramian(cotangents, self.gramian_samples).flatten()
+        cotangents = surrogate_cotangents(networks.log_prob, old_log_prob, advantages, clip_range)
+        needed = [networks.gramian(cotangents, self.gramian_samples).reshape(-1)]
         if self.target_kl is not None or self.desired_kl is not None:
-            needed = th.cat([needed, kl_estimates(networks.log_prob, batch.old_log_prob).mean().unsqueeze(0)])
+            needed.append(kl_estimates(networks.log_prob, old_log_prob).mean().reshape(1))
+        host = join(needed).cpu().numpy().astype(float)
         n = self.n_objectives
-        host = needed.cpu().numpy().astype(float)
         gramian = host[: n * n].reshape(n, n)
-        tensors = networks.log_prob, batch.old_log_prob, advantages, networks.values, batch.old_values, batch.returns
-        samples = Samples(*tensors, networks.entropy_loss(), kappa)
+        arrays = networks.log_prob, old_log_prob, advantages, networks.values, old_values, returns
+        samples = Samples(*arrays, networks.entropy_loss(), kappa)
         if not np.isfinite(gramian).all():
             raise ValueError(self._not_finite_message(Minibatch(samples, gramian, np.ones(n)), clip_range, clip_range_vf))
         assert self._resolver_rng is not None
@@ -287,9 +292,10 @@ class GCRPPO(PersistentPPO):
             return minibatch, False
         if self.desired_kl is not None and not is_first:  # before the first step the KL divergence is 0 and says nothing
             self._set_learning_rate(adapt_learning_rate(self._learning_rate, float(host[-1]), self.desired_kl))
-        weights = th.from_numpy(minibatch.weights.astype(np.float32)).to(cotangents)
-        value_gradients = value_cotangents(networks.values, batch.old_values, batch.returns, clip_range_vf)
-        networks.backward(cotangents @ weights, value_gradients.mul_(self.vf_coef), self.ent_coef)
+        weights = networks.array(th.from_numpy(minibatch.weights.astype(np.float32)).to(self.device))
+        value_gradients = value_cotangents(networks.values, old_values, returns, clip_range_vf)
+        value_gradients *= self.vf_coef
+        networks.backward(cotangents @ weights, value_gradients, self.ent_coef)
         norm = networks.clip_gradients(self.max_grad_norm)
         if not np.isfinite(norm):
             raise ValueError(self._not_finite_message(minibatch, clip_range, clip_range_vf, norm))

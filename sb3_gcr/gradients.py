@@ -7,12 +7,16 @@ c^(k) is all that distinguishes it. The step of any weights w is one backward pa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 
+#: A NumPy array or a torch tensor: the losses and their derivatives are spelled so that both take it.
+ArrayT = TypeVar("ArrayT", bound=Any)
 
-def surrogate_losses(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
+
+def surrogate_losses(log_prob: ArrayT, old_log_prob: ArrayT, advantages: ArrayT, clip_range: float) -> ArrayT:
     r"""PPO's clipped surrogate loss of each sample and component, to be minimised; one ratio ρ for all components.
 
     .. math:: L_b^{(k)} = -\min(ρ_b Â_b^{(k)}, \mathrm{clip}(ρ_b, 1-ε, 1+ε) Â_b^{(k)}), \qquad
@@ -24,11 +28,12 @@ def surrogate_losses(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: t
     :param clip_range: ε
     :return: losses before the mean over samples, shape (B, K)
     """
-    ratio = (log_prob - old_log_prob).exp().unsqueeze(1)
-    return -th.min(ratio * advantages, ratio.clamp(1 - clip_range, 1 + clip_range) * advantages)
+    ratio = _exp(log_prob - old_log_prob)[:, None]
+    xp: Any = th if isinstance(ratio, th.Tensor) else np
+    return -xp.minimum(ratio * advantages, ratio.clip(1 - clip_range, 1 + clip_range) * advantages)
 
 
-def surrogate_cotangents(log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
+def surrogate_cotangents(log_prob: ArrayT, old_log_prob: ArrayT, advantages: ArrayT, clip_range: float) -> ArrayT:
     r"""The derivatives of the mean :func:`surrogate_losses` by log π in closed form: all that an update needs of them.
 
     .. math:: c_b^{(k)} = \frac{∂L^{(k)}}{∂\log π_b} = -\frac{ρ_b Â_b^{(k)}}{B} \text{ where not clipped, else } 0
@@ -39,19 +44,20 @@ def surrogate_cotangents(log_prob: th.Tensor, old_log_prob: th.Tensor, advantage
     :param clip_range: ε
     :return: cotangents c, shape (B, K)
     """
-    ratio = (log_prob - old_log_prob).exp_().unsqueeze(1)
-    unclipped = ratio * advantages
-    clipped = ratio.clamp_(1 - clip_range, 1 + clip_range) * advantages
-    return unclipped.masked_fill_(unclipped > clipped, 0.0).div_(-len(advantages))
+    ratio = _exp(log_prob - old_log_prob)[:, None]
+    cotangents = ratio * advantages
+    cotangents[cotangents > ratio.clip(1 - clip_range, 1 + clip_range) * advantages] = 0.0
+    cotangents *= -1 / len(advantages)
+    return cotangents
 
 
-def kl_estimates(log_prob: th.Tensor, old_log_prob: th.Tensor) -> th.Tensor:
+def kl_estimates(log_prob: ArrayT, old_log_prob: ArrayT) -> ArrayT:
     """Each sample's term (ρ - 1) - log ρ of the estimate of KL(old ‖ current) that SB3's PPO logs, shape (B,)."""
     log_ratio = log_prob - old_log_prob
-    return log_ratio.exp() - 1 - log_ratio
+    return _exp(log_ratio) - 1 - log_ratio
 
 
-def value_errors(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range_vf: float | None) -> th.Tensor:
+def value_errors(values: ArrayT, old_values: ArrayT, returns: ArrayT, clip_range_vf: float | None) -> ArrayT:
     r"""Error of each value head at each sample; the change of a head is clipped as in SB3's PPO.
 
     .. math:: L_V^{(k)} = \frac{1}{B} \sum_b e_b^{(k)\,2}, \qquad e_b^{(k)} = V_b^{(k)} - Ĝ_b^{(k)}
@@ -65,11 +71,11 @@ def value_errors(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, c
     :return: e, shape (B, K)
     """
     if clip_range_vf is not None:
-        values = old_values + (values - old_values).clamp(-clip_range_vf, clip_range_vf)
+        values = old_values + (values - old_values).clip(-clip_range_vf, clip_range_vf)
     return values - returns
 
 
-def value_cotangents(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range_vf: float | None) -> th.Tensor:
+def value_cotangents(values: ArrayT, old_values: ArrayT, returns: ArrayT, clip_range_vf: float | None) -> ArrayT:
     r"""The derivatives ∂L_V^(k)/∂V_b^(k) = 2 e_b^(k) / B of the losses of :func:`value_errors`, 0 where clipped.
 
     :param values: V, shape (B, K)
@@ -80,8 +86,13 @@ def value_cotangents(values: th.Tensor, old_values: th.Tensor, returns: th.Tenso
     """
     errors = value_errors(values, old_values, returns, clip_range_vf)
     if clip_range_vf is not None:
-        errors = th.where((values - old_values).abs() > clip_range_vf, 0.0, errors)
-    return errors.mul_(2 / len(values))
+        errors[abs(values - old_values) > clip_range_vf] = 0.0
+    errors *= 2 / len(values)
+    return errors
+
+
+def _exp(array: ArrayT) -> Any:
+    return array.exp() if isinstance(array, th.Tensor) else np.exp(array)
 
 
 def gramian_by_passes(log_prob: th.Tensor, cotangents: th.Tensor, parameters: Sequence[th.nn.Parameter]) -> th.Tensor:
@@ -115,6 +126,10 @@ class ManyBackwards:
     def __init__(self, policy: Any):
         self.policy = policy
         self._parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+
+    def array(self, tensor: th.Tensor) -> th.Tensor:
+        """A tensor of the minibatch in the form that the other methods take and return: as it is."""
+        return tensor
 
     def evaluate(self, observations: Any, actions: th.Tensor) -> ManyBackwards:
         """Forward pass of actor and critic; sets ``values`` (B, K) and ``log_prob`` (B,)."""

@@ -7,7 +7,8 @@ layer's input H = (h_b), and S = ∂log π_b/∂log σ row by row,
     G_kl = c^(k)ᵀ M c^(l),    M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ + 1) + S Sᵀ,   (the 1 is the bias)
 
 and the step of any weights w has the weight gradients (Δ ∘ c w)ᵀ H. Forward and backward are written out here, because for
-small networks most of the time of an update is PyTorch's bookkeeping, not arithmetic.
+small networks most of the time of an update is PyTorch's bookkeeping, not arithmetic. For the same reason small updates on
+the CPU run on NumPy arrays in the tensors' memory: an ``Array`` is one of the two, the code is spelled so that both take it.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,9 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from torch import nn
 from torch.nn.functional import linear
 
+Array = Any
+#: Updates with at most so many (samples × parameters) on the CPU run in NumPy.
+SMALL = 2**24
 #: Numbers that a block of K weight gradients may hold at a time, on the CPU and on other devices.
 BLOCK, BLOCK_ON_DEVICE = 2**22, 2**26
 #: Minibatches up to this size get M in one piece; of larger ones only the upper half, by blocks of rows of these heights.
@@ -76,11 +81,12 @@ class Activation:
     """An activation behind a linear layer, and its derivative: closed where that is cheap, PyTorch's elsewhere.
 
     :param module: of a type in ``ACTIVATIONS``
+    :param in_numpy: whether :meth:`forward` and :meth:`backward` take and return NumPy arrays
     """
 
-    def __init__(self, module: nn.Module):
+    def __init__(self, module: nn.Module, in_numpy: bool = False):
         # The functions themselves: a call of a module costs as much as the arithmetic of a small layer.
-        self.forward: Callable[[th.Tensor], th.Tensor] = module.forward
+        self.forward: Callable[[Array], Array] = module.forward
         if isinstance(module, nn.Tanh):
             self.forward, self.backward = tanh_, _aten.tanh_backward.default
         elif isinstance(module, nn.ReLU):
@@ -90,9 +96,13 @@ class Activation:
             self.backward = lambda signal, output: _aten.elu_backward.default(signal, alpha, 1, 1, True, output)
         else:
             self.forward, self.backward = partial(self._forward_with_graph, module), self._backward_through_graph
+        if in_numpy and isinstance(module, nn.Tanh):
+            self.forward, self.backward = _tanh_in_numpy, _tanh_backward_in_numpy
+        elif in_numpy:
+            self.forward, self.backward = _on_arrays(self.forward), _on_arrays(self.backward)
 
     #: Signal in front of the activation, from the one behind it and the activation's output.
-    backward: Callable[[th.Tensor, th.Tensor], th.Tensor]
+    backward: Callable[[Array, Array], Array]
 
     def _forward_with_graph(self, module: nn.Module, preactivation: th.Tensor) -> th.Tensor:
         with th.enable_grad():
@@ -104,16 +114,36 @@ class Activation:
         return th.autograd.grad(self._output, self._input, signal, retain_graph=True)[0]
 
 
+def _tanh_in_numpy(preactivation: Array) -> Array:
+    return np.tanh(preactivation, out=preactivation)
+
+
+def _tanh_backward_in_numpy(signal: Array, output: Array) -> Array:
+    slope = output * output
+    np.subtract(1, slope, out=slope)
+    slope *= signal
+    return slope
+
+
+def _on_arrays(function: Callable[..., th.Tensor]) -> Callable[..., Array]:
+    """A function of tensors as one of NumPy arrays."""
+    return lambda *arrays: function(*map(th.from_numpy, arrays)).numpy()
+
+
 class Mlp:
     """Linear layers with an activation behind each but the last, run forward and backward by hand.
 
     :param modules: linear layers and activations in turn, beginning and ending with a linear layer
+    :param memory: of the layers' parameters and gradients
     """
 
-    def __init__(self, *modules: Any):
-        self.weights = [layer.weight for layer in modules[::2]]
-        self.biases = [layer.bias for layer in modules[::2]]
-        self.activations = [Activation(module) for module in modules[1::2]]
+    def __init__(self, *modules: Any, memory: Memory):
+        self.weights = [memory.array(layer.weight) for layer in modules[::2]]
+        self.biases = [memory.array(layer.bias) for layer in modules[::2]]
+        self.gradients = [memory.gradient(layer.weight) for layer in modules[::2]]
+        self.activations = [Activation(module, memory.in_numpy) for module in modules[1::2]]
+        self.linear = _linear_in_numpy if memory.in_numpy else linear
+        self.xp = memory.xp
 
     @staticmethod
     def fits(*modules: nn.Module) -> bool:
@@ -125,56 +155,65 @@ class Mlp:
         in_place = any(getattr(module, "inplace", False) for module in modules)
         return len(modules) % 2 == 1 and all(right_types) and not in_place
 
-    def forward(self, features: th.Tensor) -> th.Tensor:
+    def forward(self, features: Array) -> Array:
         """Output for features of shape (B, in); each layer's input H is kept."""
         self.inputs = [features]
         for weight, bias, activation in zip(self.weights, self.biases, self.activations, strict=False):
-            features = activation.forward(linear(features, weight, bias))
+            features = activation.forward(self.linear(features, weight, bias))
             self.inputs.append(features)
-        return linear(features, self.weights[-1], self.biases[-1])
+        return self.linear(features, self.weights[-1], self.biases[-1])
 
-    def signals(self, cotangent: th.Tensor) -> list[th.Tensor]:
+    def signals(self, cotangent: Array) -> list[Array]:
         """The signal Δ of shape (B, out) at each layer's output, for a cotangent of the last one."""
         signals = [cotangent]
         for weight, activation, output in zip(self.weights[:0:-1], self.activations[::-1], self.inputs[:0:-1], strict=True):
-            signals.append(activation.backward(th.mm(signals[-1], weight), output))
+            signals.append(activation.backward(signals[-1] @ weight, output))
         return signals[::-1]
 
-    def write_weight_gradients(self, signals: Iterable[th.Tensor]) -> None:
+    def write_weight_gradients(self, signals: Iterable[Array]) -> None:
         """Set the gradient of each layer's weights to Δᵀ H."""
-        for weight, signal, features in zip(self.weights, signals, self.inputs, strict=True):
-            th.mm(signal.T, features, out=weight.grad)
+        for gradient, signal, features in zip(self.gradients, signals, self.inputs, strict=True):
+            self.xp.matmul(signal.T, features, out=gradient)
+
+
+def _linear_in_numpy(features: Array, weight: Array, bias: Array) -> Array:
+    output = features @ weight.T
+    output += bias
+    return output
 
 
 class GaussianHead:
     """Diagonal Gaussian with a log σ that does not depend on the state.
 
     :param policy: has ``log_std``
+    :param memory: of its parameters and gradients
     """
 
-    def __init__(self, policy: Any):
-        self.log_std = policy.log_std
-        self._ones = th.ones_like(policy.log_std)
+    def __init__(self, policy: Any, memory: Memory):
+        self.memory = memory
+        self.log_std, self.gradient = memory.array(policy.log_std), memory.gradient(policy.log_std)
+        self._halves = memory.array(th.full_like(policy.log_std, -0.5))
 
-    def forward(self, mean: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def forward(self, mean: Array, actions: th.Tensor) -> Array:
         """Return log π(a|s) = -½ Σ ((a - μ) / σ)² - Σ log σ - ½ A log 2π, shape (B,)."""
-        self._scale = th.exp(-self.log_std)
-        self._z = (actions - mean) * self._scale
+        self._scale = self.memory.xp.exp(-self.log_std)
+        self._z = self.memory.array(actions) - mean
+        self._z *= self._scale
         self._squares = self._z * self._z
         self._log_det = self.log_std.sum() + 0.5 * _LOG_2PI * mean.shape[1]
-        return th.addmv(self._log_det, self._squares, self._ones, beta=-1, alpha=-0.5)
+        return self._squares @ self._halves - self._log_det
 
-    def signal(self) -> th.Tensor:
+    def signal(self) -> Array:
         """Return ∂log π/∂μ = (a - μ) / σ², shape (B, A)."""
         return self._z * self._scale
 
-    def score(self) -> list[th.Tensor]:
+    def score(self) -> list[Array]:
         """S = ∂log π/∂log σ = ((a - μ) / σ)² - 1, shape (B, A)."""
         return [self._squares - 1]
 
-    def entropy_loss(self) -> th.Tensor:
+    def entropy_loss(self) -> Array:
         """Minus the entropy Σ log σ + ½ A (1 + log 2π)."""
-        return -0.5 * self.log_std.numel() - self._log_det
+        return -0.5 * len(self.log_std) - self._log_det
 
     def entropy_signal(self) -> None:
         """The entropy does not depend on the mean."""
@@ -182,45 +221,81 @@ class GaussianHead:
 
     def add_entropy_gradient(self, ent_coef: float) -> None:
         """Add the gradient of the entropy loss by log σ, which is -1 for each of them."""
-        self.log_std.grad.sub_(ent_coef)
+        self.gradient -= ent_coef
 
 
 class LogitsHead:
     """Categorical, multi-categorical or Bernoulli distribution; its own little graph gives the derivatives by the logits.
 
     :param policy: has SB3's ``action_dist``
+    :param memory: says what an array is
     """
 
-    def __init__(self, policy: Any):
+    def __init__(self, policy: Any, memory: Memory):
         self.distribution = policy.action_dist
+        self.memory = memory
 
-    def forward(self, logits: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def forward(self, logits: Array, actions: th.Tensor) -> Array:
         """Return log π(a|s), shape (B,)."""
         with th.enable_grad():
-            self._logits = logits.detach().requires_grad_()
+            self._logits = th.as_tensor(logits).detach().requires_grad_()
             self.distribution.proba_distribution(self._logits)
             self._log_prob: th.Tensor = self.distribution.log_prob(actions)
             self._entropy_loss: th.Tensor = -self.distribution.entropy().mean()
-        return self._log_prob.detach()
+        return self.memory.array(self._log_prob)
 
-    def signal(self) -> th.Tensor:
+    def signal(self) -> Array:
         """Return ∂log π/∂logits, shape (B, A)."""
-        return th.autograd.grad(self._log_prob, self._logits, th.ones_like(self._log_prob), retain_graph=True)[0]
+        ones = th.ones_like(self._log_prob)
+        return self.memory.array(th.autograd.grad(self._log_prob, self._logits, ones, retain_graph=True)[0])
 
-    def score(self) -> list[th.Tensor]:
+    def score(self) -> list[Array]:
         """There is no parameter beside the logits."""
         return []
 
-    def entropy_loss(self) -> th.Tensor:
+    def entropy_loss(self) -> Array:
         """Minus the mean entropy."""
-        return self._entropy_loss.detach()
+        return self.memory.array(self._entropy_loss)
 
-    def entropy_signal(self) -> th.Tensor:
+    def entropy_signal(self) -> Array:
         """Derivative of the entropy loss by the logits, shape (B, A)."""
-        return th.autograd.grad(self._entropy_loss, self._logits, retain_graph=True)[0]
+        return self.memory.array(th.autograd.grad(self._entropy_loss, self._logits, retain_graph=True)[0])
 
     def add_entropy_gradient(self, ent_coef: float) -> None:
         """There is no parameter beside the logits."""
+
+
+class Memory:
+    """One block of memory for all gradients, and parameters and gradients as arrays.
+
+    :param first: parameters whose gradients are plain sums over samples; they lie at the beginning, so that these sums, the
+        norm of all gradients and their scaling are one operation each
+    :param policy: has all parameters
+    :param in_numpy: whether arrays are NumPy's, sharing the tensors' memory, or the tensors themselves
+    """
+
+    def __init__(self, first: list[Any], policy: nn.Module, in_numpy: bool):
+        self.in_numpy, self.xp = in_numpy, np if in_numpy else th
+        self._parameters = first + [p for p in policy.parameters() if all(p is not other for other in first)]
+        sizes = [parameter.numel() for parameter in self._parameters]
+        flat = th.zeros(sum(sizes), device=first[0].device)
+        self._gradients = [piece.view_as(p) for piece, p in zip(flat.split(sizes), self._parameters, strict=True)]
+        self.flat = self.array(flat)
+        self.sums = self.flat[: sum(sizes[: len(first)])]
+
+    def array(self, tensor: th.Tensor) -> Array:
+        """A tensor's numbers, in its own memory."""
+        return tensor.detach().numpy() if self.in_numpy else tensor.detach()
+
+    def gradient(self, parameter: nn.Parameter) -> Array:
+        """The memory of a parameter's gradient."""
+        return self.array(next(g for g, p in zip(self._gradients, self._parameters, strict=True) if p is parameter))
+
+    def attach(self) -> None:
+        """Make the block the parameters' ``grad``."""
+        if self._parameters[0].grad is not self._gradients[0]:
+            for parameter, gradient in zip(self._parameters, self._gradients, strict=True):
+                parameter.grad = gradient
 
 
 class OneBackward:
@@ -229,25 +304,29 @@ class OneBackward:
     Under ``torch.no_grad`` call :meth:`evaluate` with a minibatch, then :meth:`gramian` and :meth:`backward`.
 
     :param policy: must fit, see :meth:`fits`
+    :param n_samples: size of the minibatches to come; small ones on the CPU run in NumPy. None is PyTorch in any case
     """
 
-    def __init__(self, policy: Any):
+    def __init__(self, policy: Any, n_samples: int | None = None):
         self.policy = policy
-        self.actor, self.critic = Mlp(*_actor_modules(policy)), Mlp(*_critic_modules(policy))
+        n_parameters = sum(parameter.numel() for parameter in policy.parameters())
+        in_numpy = n_samples is not None and n_samples * n_parameters <= SMALL and policy.device.type == "cpu"
+        actor, critic = _actor_modules(policy), _critic_modules(policy)
         gaussian = isinstance(policy.action_dist, DiagGaussianDistribution)
-        self.head: GaussianHead | LogitsHead = GaussianHead(policy) if gaussian else LogitsHead(policy)
-        added = [*self.actor.biases, *([policy.log_std] if gaussian else []), *self.critic.biases]
-        # One block of memory for all gradients, first those that are plain sums over samples: their norm, their scaling, and
-        # these sums are then one operation each.
-        self._parameters = added + [p for p in policy.parameters() if all(p is not other for other in added)]
-        self._flat = th.zeros(sum(parameter.numel() for parameter in self._parameters), device=policy.device)
-        pieces = self._flat.split([parameter.numel() for parameter in self._parameters])
-        self._gradients = [piece.view_as(p) for piece, p in zip(pieces, self._parameters, strict=True)]
-        self._sums = self._flat[: sum(parameter.numel() for parameter in added)]
-        self._widths = [bias.numel() for bias in self.actor.biases]
+        biases: list[list[Any]] = [[layer.bias for layer in modules[::2]] for modules in (actor, critic)]
+        self._memory = Memory([*biases[0], *([policy.log_std] if gaussian else []), *biases[1]], policy, in_numpy)
+        self.actor, self.critic = Mlp(*actor, memory=self._memory), Mlp(*critic, memory=self._memory)
+        self.head: GaussianHead | LogitsHead
+        self.head = GaussianHead(policy, self._memory) if gaussian else LogitsHead(policy, self._memory)
+        self._widths = [bias.numel() for bias in biases[0]]
         extractor, space = policy.pi_features_extractor, policy.observation_space
         # Vectors pass through SB3's preprocessing and flattening as they are.
         self._takes_vectors = type(extractor) is FlattenExtractor and isinstance(space, spaces.Box) and len(space.shape) == 1
+
+    @property
+    def in_numpy(self) -> bool:
+        """Whether arrays are NumPy's."""
+        return self._memory.in_numpy
 
     @staticmethod
     def fits(policy: Any) -> bool:
@@ -270,66 +349,71 @@ class OneBackward:
         plain = (p.requires_grad and p.dtype == th.float32 and not p._backward_hooks for p in policy.parameters())
         return all(p in known for p in policy.parameters()) and all(plain)
 
+    def array(self, tensor: th.Tensor) -> Array:
+        """A tensor of the minibatch in the form that the other methods take and return."""
+        return self._memory.array(tensor)
+
     def evaluate(self, observations: Any, actions: th.Tensor) -> OneBackward:
         """Forward pass of actor and critic; sets ``values`` (B, K) and ``log_prob`` (B,)."""
         if self._takes_vectors:
             features = observations.float()
         else:
             features = BasePolicy.extract_features(self.policy, observations, self.policy.pi_features_extractor)
+        features = self.array(features)
         self.values = self.critic.forward(features)
         self.log_prob = self.head.forward(self.actor.forward(features), actions)
         return self
 
-    def gramian(self, cotangents: th.Tensor, n_samples: int | None = None) -> th.Tensor:
+    def gramian(self, cotangents: Array, n_samples: int | None = None) -> Array:
         """Gramian of the component gradients, shape (K, K).
 
         :param cotangents: of log π, shape (B, K)
         :param n_samples: take the first n rows of the minibatch instead of all; they are in random order already
         """
         signals = self.actor.signals(self.head.signal())
-        self._added = th.cat([*signals, *self.head.score()], 1)  # ∂log π/∂bias of all layers, and S
+        self._added = self._memory.xp.concatenate([*signals, *self.head.score()], 1)  # ∂log π/∂bias of all layers, and S
         inputs, added = self.actor.inputs, self._added
         if n_samples is not None:
-            signals, inputs = ([tensor[:n_samples] for tensor in tensors] for tensors in (signals, inputs))
+            signals, inputs = ([array[:n_samples] for array in arrays] for arrays in (signals, inputs))
             added, cotangents = added[:n_samples], cotangents[:n_samples]
         return layer_gramian(signals, inputs, added, cotangents)
 
-    def entropy_loss(self) -> th.Tensor:
+    def entropy_loss(self) -> Array:
         """PPO's entropy loss: minus the mean entropy."""
         return self.head.entropy_loss()
 
-    def backward(self, cotangent: th.Tensor, value_cotangents: th.Tensor, ent_coef: float) -> None:
+    def backward(self, cotangent: Array, value_cotangents: Array, ent_coef: float) -> None:
         """Set the gradient of the whole loss; call :meth:`gramian` before.
 
         :param cotangent: of log π, shape (B,)
         :param value_cotangents: of the values, shape (B, K)
         :param ent_coef: weight of the entropy loss
         """
-        if self._parameters[0].grad is not self._gradients[0]:
-            for parameter, gradient in zip(self._parameters, self._gradients, strict=True):
-                parameter.grad = gradient
-        column = cotangent.unsqueeze(1)
+        self._memory.attach()
+        concatenate, column = self._memory.xp.concatenate, cotangent[:, None]
         entropy_signal = self.head.entropy_signal() if ent_coef != 0 else None
         if entropy_signal is None:
             added = self._added * column
         else:
-            added = th.cat(self.actor.signals(self.head.signal() * column + ent_coef * entropy_signal), 1)
+            added = concatenate(self.actor.signals(self.head.signal() * column + ent_coef * entropy_signal), 1)
         critic_signals = self.critic.signals(value_cotangents)
-        self.actor.write_weight_gradients(added[:, : sum(self._widths)].split_with_sizes(self._widths, 1))
+        ends = list(accumulate(self._widths))
+        self.actor.write_weight_gradients(added[:, end - n : end] for n, end in zip(self._widths, ends, strict=True))
         self.critic.write_weight_gradients(critic_signals)
-        th.sum(th.cat([added, *critic_signals], 1), 0, out=self._sums)
+        self._memory.sums[:] = concatenate([added, *critic_signals], 1).sum(0)
         if ent_coef != 0:
             self.head.add_entropy_gradient(ent_coef)
 
     def clip_gradients(self, max_norm: float) -> float:
         """Scale all gradients down to a joint norm of at most ``max_norm``, as ``clip_grad_norm_``; the norm before."""
-        norm = math.sqrt(th.dot(self._flat, self._flat).item())
+        flat = self._memory.flat
+        norm = math.sqrt(float(flat @ flat))
         if norm > max_norm:
-            self._flat.mul_(max_norm / (norm + 1e-6))
+            flat *= max_norm / (norm + 1e-6)
         return norm
 
 
-def layer_gramian(signals: list[th.Tensor], inputs: list[th.Tensor], added: th.Tensor, cotangents: th.Tensor) -> th.Tensor:
+def layer_gramian(signals: list[Array], inputs: list[Array], added: Array, cotangents: Array) -> Array:
     """Gramian of the K gradients Σ_b c_b^(k) (δ_b h_bᵀ, …, a_b) over all layers; per layer the cheaper of two exact forms.
 
     :param signals: Δ of each layer, shapes (B, out)
@@ -339,63 +423,63 @@ def layer_gramian(signals: list[th.Tensor], inputs: list[th.Tensor], added: th.T
     :return: G, shape (K, K)
     """
     n_samples, n_objectives = cotangents.shape
-    by_samples = [
-        0.6 * n_samples * (signal.shape[1] + features.shape[1] + ELEMENTWISE)
-        <= n_objectives * signal.shape[1] * features.shape[1]
-        for signal, features in zip(signals, inputs, strict=True)
-    ]
-    layers = list(zip(signals, inputs, strict=True))
-    jacobian = th.mm(cotangents.T, added)
-    gramian = th.mm(jacobian, jacobian.T)
-    few = [layer for layer, take in zip(layers, by_samples, strict=True) if take]
+    jacobian = cotangents.T @ added
+    gramian = jacobian @ jacobian.T
+    few = []
+    for signal, features in zip(signals, inputs, strict=True):
+        n_outputs, n_inputs = signal.shape[1], features.shape[1]
+        if 0.6 * n_samples * (n_outputs + n_inputs + ELEMENTWISE) <= n_objectives * n_outputs * n_inputs:
+            few.append((signal, features))
+        else:
+            gramian += _gramian_by_weights(signal, features, cotangents)
     if few:
         gramian += _gramian_by_samples(few, cotangents)
-    for (signal, features), take in zip(layers, by_samples, strict=True):
-        if not take:
-            gramian += _gramian_by_weights(signal, features, cotangents)
     return gramian
 
 
-def _gramian_by_samples(layers: list[tuple[th.Tensor, th.Tensor]], cotangents: th.Tensor) -> th.Tensor:
+def _gramian_by_samples(layers: list[tuple[Array, Array]], cotangents: Array) -> Array:
     """Cᵀ M C with M = Σ_layers (Δ Δᵀ) ∘ (H Hᵀ), by blocks of rows; of the symmetric M only the upper half."""
-    n_samples, n_objectives = cotangents.shape
+    n_samples = len(cotangents)
     if n_samples <= WHOLE:
-        return _rows_of_products([(s, s, h, h) for s, h in layers], cotangents).mm(cotangents)
-    half = cotangents.new_zeros(n_objectives, n_objectives)
+        return _rows_of_products([(s, s, h, h) for s, h in layers], cotangents) @ cotangents
+    half: Array = 0.0
     height = min(HIGHEST, max(LOWEST, n_samples // 4))
     for start in range(0, n_samples, height):
         rows, columns = slice(start, start + height), slice(start, n_samples)
         left = _rows_of_products([(s[rows], s[columns], h[rows], h[columns]) for s, h in layers], cotangents[rows])
-        left[:, :height].mul_(0.5)  # the square on the diagonal is symmetric itself
-        half.addmm_(left, cotangents[columns])
+        left[:, :height] *= 0.5  # the square on the diagonal is symmetric itself
+        half = half + left @ cotangents[columns]
     return half + half.T
 
 
-def _rows_of_products(layers: list[tuple[th.Tensor, ...]], cotangents: th.Tensor) -> th.Tensor:
+def _rows_of_products(layers: list[tuple[Array, ...]], cotangents: Array) -> Array:
     """Cᵀ M for a block of M's rows and columns: much faster than M C, which has K columns instead of K rows.
 
     :param layers: Δ and H of each layer, in the block's rows and columns: (Δ_rows, Δ_columns, H_rows, H_columns)
     :param cotangents: C in the block's rows
     """
-    block: th.Tensor | None = None
+    block: Array = None
     for signal, other_signal, features, other_features in layers:
-        products = th.mm(signal, other_signal.T)
-        overlaps = th.mm(features, other_features.T)
-        block = products.mul_(overlaps) if block is None else block.addcmul_(products, overlaps)
-    assert block is not None
-    return th.mm(cotangents.T, block)
+        products = signal @ other_signal.T
+        products *= features @ other_features.T
+        if block is None:
+            block = products
+        else:
+            block += products
+    return cotangents.T @ block
 
 
-def _gramian_by_weights(signal: th.Tensor, features: th.Tensor, cotangents: th.Tensor) -> th.Tensor:
+def _gramian_by_weights(signal: Array, features: Array, cotangents: Array) -> Array:
     """J Jᵀ with the K weight gradients (Δ ∘ c^(k))ᵀ H as rows, a block of output units at a time."""
     n_samples, n_objectives = cotangents.shape
-    block = BLOCK if signal.device.type == "cpu" else BLOCK_ON_DEVICE
-    width = max(1, block // (n_objectives * max(n_samples, features.shape[1])))
-    gramian = cotangents.new_zeros(n_objectives, n_objectives)
-    for units in signal.T.split(width):
-        weighted = (cotangents.T.unsqueeze(1) * units).flatten(0, 1)  # (K · units, B)
-        jacobian = th.mm(weighted, features).view(n_objectives, -1)
-        gramian += jacobian @ jacobian.T
+    block = BLOCK_ON_DEVICE if isinstance(signal, th.Tensor) and signal.device.type != "cpu" else BLOCK
+    height = max(1, block // (n_objectives * max(n_samples, features.shape[1])))
+    gramian: Array = 0.0
+    for start in range(0, signal.shape[1], height):
+        units = signal.T[start : start + height]
+        weighted = (cotangents.T[:, None] * units).reshape(-1, n_samples)  # (K · units, B)
+        jacobian = (weighted @ features).reshape(n_objectives, -1)
+        gramian = gramian + jacobian @ jacobian.T
     return gramian
 
 

@@ -160,9 +160,10 @@ OTHERS = {
 
 @pytest.mark.parametrize("name", list(FITTING))
 @pytest.mark.parametrize("ent_coef", [0.0, 0.7])
+@pytest.mark.parametrize("n_samples", [None, B])
 @th.no_grad()
-def test_one_backward_is_k_backwards(name: str, ent_coef: float) -> None:
-    """Values, log π, entropy, Gramian, the resolved gradient and its clipping, to float32 rounding."""
+def test_one_backward_is_k_backwards(name: str, ent_coef: float, n_samples: int | None) -> None:
+    """Values, log π, entropy, Gramian, the resolved gradient and its clipping, to float32 rounding, in PyTorch and NumPy."""
     policy, observations = make(**FITTING[name])
     policy.set_training_mode(True)
     assert OneBackward.fits(policy)
@@ -175,15 +176,17 @@ def test_one_backward_is_k_backwards(name: str, ent_coef: float) -> None:
     results = []
     for networks in (
         ManyBackwards(policy).evaluate(observations, actions),
-        OneBackward(policy).evaluate(observations, actions),
+        OneBackward(policy, n_samples).evaluate(observations, actions),
     ):
-        gramian = networks.gramian(cotangents)
-        subset = networks.gramian(cotangents, n_samples=10)
+        mine, its = networks.array(cotangents), networks.array(value_cotangents)
+        gramian = networks.gramian(mine)
+        subset = networks.gramian(mine, n_samples=10)
         numbers = [networks.values, networks.log_prob, networks.entropy_loss().reshape(())]
-        networks.backward(cotangents @ weights, value_cotangents, ent_coef)
+        networks.backward(mine @ networks.array(weights), its, ent_coef)
         norm = networks.clip_gradients(0.5)
         gradients = [parameter.grad.clone() for parameter in policy.parameters()]
-        results.append([t.detach() for t in (gramian, subset, *numbers, th.tensor(norm), *gradients)])
+        results.append([th.as_tensor(t).detach() for t in (gramian, subset, *numbers, th.tensor(norm), *gradients)])
+    assert getattr(networks, "in_numpy", None) is (n_samples is not None)
     for expected, actual in zip(*results, strict=True):
         th.testing.assert_close(actual, expected, rtol=2e-4, atol=2e-5 * max(1.0, float(expected.abs().max())))
 
@@ -249,3 +252,5 @@ def test_both_forms_of_the_gramian(
         rows.append(th.cat(parts))
     expected = th.stack(rows) @ th.stack(rows).T
     th.testing.assert_close(layer_gramian(signals, inputs, added, cotangents), expected)
+    arrays = [signal.numpy() for signal in signals], [features.numpy() for features in inputs], added.numpy()
+    np.testing.assert_allclose(layer_gramian(*arrays, cotangents.numpy()), expected, rtol=1e-7, atol=1e-9)
