@@ -41,30 +41,32 @@ def pieces(setting: Setting, n_components: int) -> dict[str, float]:
     rollout = make_rollout(setting, n_components)
     fill_buffer(model.rollout_buffer, rollout, *evaluate(model.policy, rollout))
     batch = next(iter(model.rollout_buffer.get(setting.batch_size)))
-    networks = OneBackward(model.policy).evaluate(batch.observations, batch.actions)
-    arguments = (batch.old_log_prob, batch.advantages, 0.2)
+    networks = OneBackward(model.policy, setting.batch_size).evaluate(batch.observations, batch.actions)
+    old_values, returns = networks.array(batch.old_values), networks.array(batch.returns)
+    arguments = (networks.array(batch.old_log_prob), networks.array(batch.advantages), 0.2)
     cotangents = surrogate_cotangents(networks.log_prob, *arguments)
-    value_gradients = value_cotangents(networks.values, batch.old_values, batch.returns, None)
-    gramian = networks.gramian(cotangents).double().numpy()
+    value_gradients = value_cotangents(networks.values, old_values, returns, None)
+    gramian = np.asarray(networks.gramian(cotangents), dtype=float)
     levels, rng = np.array(model.reward_spec.levels), np.random.default_rng(0)
 
     def derivatives() -> None:
         surrogate_cotangents(networks.log_prob, *arguments)
-        value_cotangents(networks.values, batch.old_values, batch.returns, None)
+        value_cotangents(networks.values, old_values, returns, None)
 
     networks.backward(cotangents.sum(1), value_gradients, 0.0)
     model.policy.optimizer.step()
     n_batches = setting.n_samples // setting.batch_size
-    return {
-        "minibatch from the rollout": microseconds(lambda: list(model.rollout_buffer.get(setting.batch_size))) / n_batches,
-        "forward pass": microseconds(lambda: networks.evaluate(batch.observations, batch.actions)),
-        "derivatives of the losses": microseconds(derivatives),
-        "signals and Gramian": microseconds(lambda: networks.gramian(cotangents)),
-        "resolver": microseconds(lambda: RESOLVERS["gcr"](gramian, levels, rng)),
-        "backward pass": microseconds(lambda: networks.backward(cotangents.sum(1), value_gradients, 0.0)),
-        "norm and clip": microseconds(lambda: networks.clip_gradients(0.5)),
-        "Adam": microseconds(model.policy.optimizer.step),
-    }
+    with networks.one_thread():
+        return {
+            "minibatch from the rollout": microseconds(lambda: list(model.rollout_buffer.get(setting.batch_size))) / n_batches,
+            "forward pass": microseconds(lambda: networks.evaluate(batch.observations, batch.actions)),
+            "derivatives of the losses": microseconds(derivatives),
+            "signals and Gramian": microseconds(lambda: networks.gramian(cotangents)),
+            "resolver": microseconds(lambda: RESOLVERS["gcr"](gramian, levels, rng)),
+            "backward pass": microseconds(lambda: networks.backward(cotangents.sum(1), value_gradients, 0.0)),
+            "norm and clip": microseconds(lambda: networks.clip_gradients(0.5)),
+            "Adam": microseconds(model.policy.optimizer.step),
+        }
 
 
 def main() -> None:

@@ -183,8 +183,10 @@ class GCRPPO(PersistentPPO):
             self._weigh(np.eye(self.n_objectives), np.random.default_rng(0))
         result = super()._setup_learn(*args, **kwargs)
         if not self._is_plain_ppo:
-            way = "one backward pass" if isinstance(self._choose_networks(), OneBackward) else "K backward passes"
-            self.logger.info(f"Gradients of the components: {way}")
+            networks = self._choose_networks()
+            way = "one backward pass" if isinstance(networks, OneBackward) else "K backward passes"
+            library = "NumPy" if isinstance(networks, OneBackward) and networks.in_numpy else "PyTorch"
+            self.logger.info(f"Gradients of the components: {way} in {library}")
         return result
 
     @th.no_grad()
@@ -209,18 +211,17 @@ class GCRPPO(PersistentPPO):
         kappa = self._normalize_rollout()
         epochs: list[EpochStatistics] = []
         continue_training = True
-        for _ in range(self.n_epochs):
-            minibatches: list[Minibatch] = []
-            for batch in self.rollout_buffer.get(self.batch_size):
-                is_first = not (epochs or minibatches)
-                minibatch, continue_training = self._train_minibatch(batch, kappa, clip_range, clip_range_vf, is_first)
-                minibatches.append(minibatch)
-                if not continue_training:
-                    break
-            epochs.append(measure_epoch(minibatches, clip_range, clip_range_vf))
-            self._n_updates += 1
-            if not continue_training:
-                break
+        with self._networks.one_thread():
+            while continue_training and len(epochs) < self.n_epochs:
+                minibatches: list[Minibatch] = []
+                for batch in self.rollout_buffer.get(self.batch_size):
+                    is_first = not (epochs or minibatches)
+                    minibatch, continue_training = self._train_minibatch(batch, kappa, clip_range, clip_range_vf, is_first)
+                    minibatches.append(minibatch)
+                    if not continue_training:
+                        break
+                epochs.append(measure_epoch(minibatches, clip_range, clip_range_vf))
+        self._n_updates += len(epochs)
         self._n_rollouts_learned += 1
         self._log_update(epochs, clip_range, clip_range_vf)
 

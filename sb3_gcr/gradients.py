@@ -7,6 +7,7 @@ c^(k) is all that distinguishes it. The step of any weights w is one backward pa
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 import numpy as np
@@ -126,6 +127,10 @@ class ManyBackwards:
     def __init__(self, policy: Any):
         self.policy = policy
         self._parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+
+    def one_thread(self) -> AbstractContextManager[Any]:
+        """Threads are PyTorch's own business here."""
+        return nullcontext()
 
     def array(self, tensor: th.Tensor) -> th.Tensor:
         """A tensor of the minibatch in the form that the other methods take and return: as it is."""

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from functools import partial
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache, partial
 from itertools import accumulate
 from typing import Any
 
@@ -30,12 +31,13 @@ from stable_baselines3.common.distributions import (
 )
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, MlpExtractor
+from threadpoolctl import ThreadpoolController
 from torch import nn
 from torch.nn.functional import linear
 
 Array = Any
-#: Updates with at most so many (samples × parameters) on the CPU run in NumPy.
-SMALL = 2**24
+#: Updates with at most so many (samples × parameters) on the CPU run in NumPy, with one thread for PyTorch and with more.
+SMALL, SMALL_FOR_THREADS = 2**25, 2**23
 #: Numbers that a block of K weight gradients may hold at a time, on the CPU and on other devices.
 BLOCK, BLOCK_ON_DEVICE = 2**22, 2**26
 #: Minibatches up to this size get M in one piece; of larger ones only the upper half, by blocks of rows of these heights.
@@ -298,6 +300,12 @@ class Memory:
                 parameter.grad = gradient
 
 
+@cache
+def _blas() -> ThreadpoolController:
+    """The BLAS libraries of this process; finding them takes milliseconds."""
+    return ThreadpoolController().select(user_api="blas")
+
+
 class OneBackward:
     """An actor-critic of linear layers, evaluated and differentiated by hand: what ``ManyBackwards`` does, at PPO's price.
 
@@ -310,7 +318,8 @@ class OneBackward:
     def __init__(self, policy: Any, n_samples: int | None = None):
         self.policy = policy
         n_parameters = sum(parameter.numel() for parameter in policy.parameters())
-        in_numpy = n_samples is not None and n_samples * n_parameters <= SMALL and policy.device.type == "cpu"
+        limit = SMALL if th.get_num_threads() == 1 else SMALL_FOR_THREADS
+        in_numpy = n_samples is not None and n_samples * n_parameters <= limit and policy.device.type == "cpu"
         actor, critic = _actor_modules(policy), _critic_modules(policy)
         gaussian = isinstance(policy.action_dist, DiagGaussianDistribution)
         biases: list[list[Any]] = [[layer.bias for layer in modules[::2]] for modules in (actor, critic)]
@@ -348,6 +357,10 @@ class OneBackward:
         known = {p for m in modules for p in (m.weight, m.bias)} | {getattr(policy, "log_std", None)}
         plain = (p.requires_grad and p.dtype == th.float32 and not p._backward_hooks for p in policy.parameters())
         return all(p in known for p in policy.parameters()) and all(plain)
+
+    def one_thread(self) -> AbstractContextManager[Any]:
+        """Hold NumPy's BLAS, where it is used, to one thread: several would wait for each other longer than they work."""
+        return _blas().limit(limits=1) if self.in_numpy else nullcontext()
 
     def array(self, tensor: th.Tensor) -> Array:
         """A tensor of the minibatch in the form that the other methods take and return."""

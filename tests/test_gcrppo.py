@@ -92,12 +92,17 @@ def test_sum_with_minibatch_scope_takes_ppos_first_step(method: str) -> None:
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"clip_range_vf": 0.2, "ent_coef": 0.02}, {"target_kl": 0.02}])
-def test_both_ways_to_the_gramian_train_alike(kwargs: Any) -> None:
-    models = [
-        GCRPPO("MlpPolicy", make_vec_env(Env, 2, seed=0), gramian_method=method, **SMALL, **kwargs).learn(128)
-        for method in ("one_backward", "passes")
-    ]
-    th.testing.assert_close(parameters(models[0]), parameters(models[1]), rtol=1e-3, atol=1e-5)
+def test_all_ways_to_the_gramian_train_alike(kwargs: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One backward pass in NumPy and in PyTorch, and K of them."""
+    models = []
+    for method, limit in (("passes", 0), ("one_backward", 2**25), ("one_backward", 0)):
+        for name in ("SMALL", "SMALL_FOR_THREADS"):
+            monkeypatch.setattr(f"sb3_gcr.one_backward.{name}", limit)
+        model = GCRPPO("MlpPolicy", make_vec_env(Env, 2, seed=0), gramian_method=method, **SMALL, **kwargs).learn(128)
+        models.append(model)
+        assert getattr(model._networks, "in_numpy", False) is (limit > 0)
+    for model in models[1:]:
+        th.testing.assert_close(parameters(models[0]), parameters(model), rtol=1e-3, atol=1e-5)
 
 
 def test_general_path_with_one_objective_is_ppo_to_rounding() -> None:
@@ -682,6 +687,6 @@ def test_verbose_says_what_runs(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert "3 reward components: go (task), stay (task), save (regulariser)" in out
     assert "| go        | task        |" in out
-    assert "Gradients of the components: one backward pass" in out
+    assert "Gradients of the components: one backward pass in NumPy" in out
     GCRPPO("MlpPolicy", make_vec_env(Env, 1), verbose=1, use_sde=True, **SMALL).learn(32)
-    assert "Gradients of the components: K backward passes" in capsys.readouterr().out
+    assert "Gradients of the components: K backward passes in PyTorch" in capsys.readouterr().out

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from threadpoolctl import threadpool_info
 from torch import nn
 
+from sb3_gcr import one_backward
 from sb3_gcr.gradients import (
     ManyBackwards,
     gramian_by_passes,
@@ -189,6 +191,31 @@ def test_one_backward_is_k_backwards(name: str, ent_coef: float, n_samples: int 
     assert getattr(networks, "in_numpy", None) is (n_samples is not None)
     for expected, actual in zip(*results, strict=True):
         th.testing.assert_close(actual, expected, rtol=2e-4, atol=2e-5 * max(1.0, float(expected.abs().max())))
+
+
+@pytest.mark.parametrize(("threads", "limit"), [(1, "SMALL"), (2, "SMALL_FOR_THREADS")])
+def test_small_updates_run_in_numpy_with_one_thread(threads: int, limit: str) -> None:
+    policy, _ = make()
+    n_parameters = sum(parameter.numel() for parameter in policy.parameters())
+    largest = getattr(one_backward, limit) // n_parameters
+    before = th.get_num_threads()
+    th.set_num_threads(threads)
+    try:
+        small, large = OneBackward(policy, largest), OneBackward(policy, largest + 1)
+    finally:
+        th.set_num_threads(before)
+    assert small.in_numpy
+    assert not large.in_numpy
+
+    def blas_threads() -> list[int]:
+        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+    outside = blas_threads()
+    with large.one_thread():
+        assert blas_threads() == outside
+    with small.one_thread():
+        assert set(blas_threads()) <= {1}
+    assert blas_threads() == outside
 
 
 @pytest.mark.parametrize("name", list(OTHERS))

@@ -68,7 +68,7 @@ ARROWS = {
 FORBIDDEN = {
     "advantages": {"torch", "stable_baselines3"},
     "resolvers": {"stable_baselines3"},
-    "gradients": {"stable_baselines3", "numpy"},
+    "gradients": {"stable_baselines3"},
     "envs.task": {"torch", "stable_baselines3"},
     "envs.humanoid": {"torch", "stable_baselines3"},
     "envs.planar": {"torch", "stable_baselines3"},
