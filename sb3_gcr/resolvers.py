@@ -108,15 +108,15 @@ def _project_rows_together(directions: Array, norms: Array, levels: Levels, orde
     """Weights of :func:`gcr`, all components meeting their next one at the same time."""
     n = len(norms)
     each = np.arange(n)[:, None]
-    yields = (levels[:, None] >= levels[order]) & (order != each)
+    yields = ((levels[:, None] >= levels[order]) & (order != each)).T
+    directions_met = directions[order.T]
+    directions_met *= yields[:, :, None]
     inner, removed = directions.copy(), []
-    steps = zip(directions[order.T], (order + n * each).T, np.where(yields, -TOLERANCE, -np.inf).T, strict=True)
-    for met, places, threshold in steps:  # of each component's next one: its cosines, ⟨g_i', g_j⟩, below which it is met
-        cosine = inner.take(places)
-        cosine *= cosine < threshold
+    for met, places in zip(directions_met, (order + n * each).T, strict=True):  # for each component its next one
+        cosine = np.minimum(inner.take(places), 0.0)  # ⟨g_i', g_j⟩ / (|g_i| |g_j|)
         inner -= cosine[:, None] * met
-        removed.append(cosine * norms)
-    total = np.bincount(order.T.ravel(), np.concatenate(removed), n)
+        removed.append(cosine)
+    total = np.bincount(order.T.ravel(), (np.array(removed) * yields * norms).ravel(), n)
     return 1 - np.divide(total, norms, out=np.zeros_like(norms), where=norms > 0)
 
 
