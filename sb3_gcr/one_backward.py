@@ -37,7 +37,7 @@ from torch.nn.functional import linear
 
 Array = Any
 #: Updates with at most so many (samples × parameters) on the CPU run in NumPy, with one thread for PyTorch and with more.
-SMALL, SMALL_FOR_THREADS = 2**25, 2**23
+SMALL, SMALL_FOR_THREADS = 2**25, 2**24
 #: Numbers that a block of K weight gradients may hold at a time, on the CPU and on other devices.
 BLOCK, BLOCK_ON_DEVICE = 2**22, 2**26
 #: Minibatches up to this size get M in one piece; of larger ones only the upper half, by blocks of rows of these heights.
