@@ -202,7 +202,8 @@ class GaussianHead:
         self._z = self.memory.array(actions) - mean
         self._z *= self._scale
         self._squares = self._z * self._z
-        self._log_det = self.log_std.sum() + 0.5 * _LOG_2PI * mean.shape[1]
+        # An array of one number: NumPy 1 makes double precision of a scalar.
+        self._log_det = self.log_std.sum(0, keepdims=True) + 0.5 * _LOG_2PI * mean.shape[1]
         return self._squares @ self._halves - self._log_det
 
     def signal(self) -> Array:
