@@ -23,7 +23,7 @@ Resolver = Callable[[Array, Levels, np.random.Generator], Array]
 #: Two gradients conflict when ⟨g_i, g_j⟩ is below minus this share of |g_i| |g_j|: rounding is no conflict.
 TOLERANCE = 1e-12
 #: Up to so many components the projections run row by row.
-FEW = 11
+FEW = 10
 #: A component whose squared gradient norm is below this share of the largest one has no gradient.
 ZERO_ROW = 1e-40
 #: Eigenvalues of a Gramian of unit gradients below this share of the largest are rounding.
@@ -107,17 +107,19 @@ def _project_row_by_row(directions: Array, norms: Array, levels: Levels, order: 
 def _project_rows_together(directions: Array, norms: Array, levels: Levels, order: NDArray[np.intp]) -> Array:
     """Weights of :func:`gcr`, all components meeting their next one at the same time."""
     n = len(norms)
-    each = np.arange(n)[:, None]
-    yields = ((levels[:, None] >= levels[order]) & (order != each)).T
-    directions_met = directions[order.T]
-    directions_met *= yields[:, :, None]
-    inner, removed = directions.copy(), []
-    for met, places in zip(directions_met, (order + n * each).T, strict=True):  # for each component its next one
-        cosine = np.minimum(inner.take(places), 0.0)  # ⟨g_i', g_j⟩ / (|g_i| |g_j|)
-        inner -= cosine[:, None] * met
-        removed.append(cosine)
-    total = np.bincount(order.T.ravel(), (np.array(removed) * yields * norms).ravel(), n)
-    return 1 - np.divide(total, norms, out=np.zeros_like(norms), where=norms > 0)
+    met = order.T.copy()  # row by row: whom each component meets in this step
+    yields = (levels >= levels[met]) & (met != np.arange(n))
+    steps = directions.take(met, 0)  # (steps, K, K)
+    steps *= yields[:, :, None]
+    inner, removed = directions.copy(), np.empty((n, n))  # ⟨g_i', g_j⟩ / (|g_i| |g_j|), and its negative part at each step
+    for step, places, cosine, column in zip(steps, met + n * np.arange(n), removed, removed[:, :, None], strict=True):
+        inner.take(places, out=cosine, mode="clip")  # in range; the mode saves a copy
+        np.minimum(cosine, 0.0, out=cosine)
+        step *= column
+        inner -= step
+    removed *= yields
+    removed *= norms
+    return 1 - np.divide(np.bincount(met.ravel(), removed.ravel(), n), norms, out=np.zeros_like(norms), where=norms > 0)
 
 
 def no_priority(gramian: Array, levels: Levels, rng: np.random.Generator) -> Array:
