@@ -12,7 +12,7 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_gcr.components import RewardSpec, level_label
-from sb3_gcr.gradients import kl_estimates, surrogate_losses, value_errors
+from sb3_gcr.gradients import kl_estimates, leaves_range, surrogate_losses, value_errors
 from sb3_gcr.resolvers import conflicts, cosines
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def measure_epoch(minibatches: Sequence[Minibatch], clip_range: float, clip_rang
     figures = [
         surrogate_losses(log_prob, old_log_prob, advantages, clip_range),
         value_errors(values, old_values, returns, clip_range_vf).square(),
-        ((log_prob - old_log_prob).exp() - 1).abs().gt(clip_range).to(log_prob.dtype).unsqueeze(1),
+        leaves_range(log_prob, old_log_prob, clip_range).to(log_prob.dtype).unsqueeze(1),
         kl_estimates(log_prob, old_log_prob).unsqueeze(1),
     ]
     sizes = th.tensor([len(array) for array in columns[0]], device=log_prob.device)

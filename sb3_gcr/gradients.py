@@ -1,20 +1,20 @@
 """The component losses, their cotangents, and the Gramian of their gradients.
 
 All K surrogates share one log π(a_b|s_b), so the gradient of component k is Σ_b c_b^(k) ∇_θ log π(a_b|s_b): its cotangent
-c^(k) is all that distinguishes it. The step of any weights w is one backward pass with the cotangent c w.
+c^(k) is all that distinguishes it. The step of any weights w is one backward pass with the cotangent c w. NumPy arrays and
+tensors both fit into losses and cotangents.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch as th
 
-#: A NumPy array or a torch tensor: the losses and their derivatives are spelled so that both take it.
-ArrayT = TypeVar("ArrayT", bound=Any)
+from sb3_gcr.advantages import ArrayT
 
 
 def surrogate_losses(log_prob: ArrayT, old_log_prob: ArrayT, advantages: ArrayT, clip_range: float) -> ArrayT:
@@ -56,6 +56,11 @@ def kl_estimates(log_prob: ArrayT, old_log_prob: ArrayT) -> ArrayT:
     """Each sample's term (ρ - 1) - log ρ of the estimate of KL(old ‖ current) that SB3's PPO logs, shape (B,)."""
     log_ratio = log_prob - old_log_prob
     return _exp(log_ratio) - 1 - log_ratio
+
+
+def leaves_range(log_prob: ArrayT, old_log_prob: ArrayT, clip_range: float) -> ArrayT:
+    """Which samples' ratios have left the clip range, abs(ρ - 1) > ε: SB3's clip fraction is their share; shape (B,)."""
+    return abs(_exp(log_prob - old_log_prob) - 1) > clip_range  # type: ignore[no-any-return]
 
 
 def value_errors(values: ArrayT, old_values: ArrayT, returns: ArrayT, clip_range_vf: float | None) -> ArrayT:

@@ -74,8 +74,7 @@ def tanh_(preactivation: th.Tensor) -> th.Tensor:
     """Hyperbolic tangent in place; on the CPU by NumPy, which takes a fifth of PyTorch's time on an AMD EPYC."""
     if preactivation.device.type != "cpu":
         return preactivation.tanh_()
-    array = preactivation.numpy()
-    np.tanh(array, out=array)
+    _tanh_in_numpy(preactivation.numpy())
     return preactivation
 
 

@@ -114,7 +114,7 @@ def _project_rows_together(directions: Array, norms: Array, levels: Levels, orde
     inner, removed = directions.copy(), np.empty((n, n))  # ⟨g_i', g_j⟩ / (|g_i| |g_j|), and its negative part at each step
     for step, places, cosine, column in zip(steps, met + n * np.arange(n), removed, removed[:, :, None], strict=True):
         inner.take(places, out=cosine, mode="clip")  # in range; the mode saves a copy
-        np.minimum(cosine, 0.0, out=cosine)
+        cosine *= cosine < -TOLERANCE
         step *= column
         inner -= step
     removed *= yields

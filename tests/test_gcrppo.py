@@ -114,6 +114,23 @@ def test_general_path_with_one_objective_is_ppo_to_rounding() -> None:
     th.testing.assert_close(parameters(models[0]), parameters(models[1]), rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.parametrize("method", ["one_backward", "passes"])
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+def test_logged_figures_are_ppos(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Our own loop with one component, uneven minibatches and clipping logs what SB3's PPO logs."""
+    monkeypatch.setattr(GCRPPO, "_is_plain_ppo", False)
+    settings: dict[str, Any] = {"n_steps": 32, "batch_size": 24, "n_epochs": 3, "seed": 0, "learning_rate": 0.01}
+    logs = []
+    for algorithm, kwargs in ((PPO, {}), (GCRPPO, {"gramian_method": method})):
+        env = make_vec_env(lambda: Env(None), n_envs=2, seed=0)
+        model = algorithm("MlpPolicy", env, ent_coef=0.01, clip_range_vf=0.05, **settings, **kwargs).learn(64)
+        logs.append(model.logger.name_to_value)
+    keys = [key for key in logs[0] if key.startswith("train/")]
+    assert logs[0]["train/clip_fraction"] > 0
+    assert {"train/approx_kl", "train/loss", "train/value_loss", "train/policy_gradient_loss", "train/entropy_loss"} <= {*keys}
+    assert {key: logs[1][key] for key in keys} == pytest.approx({key: logs[0][key] for key in keys}, rel=1e-3, abs=1e-5)
+
+
 # ------------------------------------------------- envs, policies, action spaces
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 from torch import nn
 
 from sb3_gcr import one_backward
@@ -210,12 +210,13 @@ def test_small_updates_run_in_numpy_with_one_thread(threads: int, limit: str) ->
     def blas_threads() -> list[int]:
         return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
 
-    outside = blas_threads()
-    with large.one_thread():
-        assert blas_threads() == outside
-    with small.one_thread():
-        assert set(blas_threads()) <= {1}
-    assert blas_threads() == outside
+    with threadpool_limits(2, user_api="blas"):
+        assert 2 in blas_threads()
+        with large.one_thread():
+            assert 2 in blas_threads()
+        with small.one_thread():
+            assert set(blas_threads()) == {1}
+        assert 2 in blas_threads()
 
 
 @pytest.mark.parametrize("name", list(OTHERS))

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 #: Modules of ours that each module may import.
 ARROWS = {
     "advantages": set(),
-    "gradients": set(),
+    "gradients": {"advantages"},
     "resolvers": set(),
     "one_backward": set(),
     "schedules": set(),

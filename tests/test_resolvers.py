@@ -51,6 +51,17 @@ def test_gcr_is_the_papers_projection_in_gradient_space(levels: list[int], seed:
     np.testing.assert_allclose(step(gcr, jacobian, levels, np.random.default_rng(seed)), expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("n", [FEW, FEW + 1])
+def test_rounding_is_no_conflict_for_few_or_many(n: int) -> None:
+    """A small gradient next to a huge one: what rounding makes of orthogonal must not show in its weight."""
+    gramian = np.eye(n)
+    gramian[0, 0] = 1e24
+    gramian[0, 1] = gramian[1, 0] = -1e-2  # cosine -1e-14
+    gramian[2, 3] = gramian[3, 2] = -0.5
+    weights = gcr(gramian, np.zeros(n, dtype=int), np.random.default_rng(0))
+    np.testing.assert_array_equal(weights, np.where(np.isin(np.arange(n), (2, 3)), 1.5, 1.0))
+
+
 @pytest.mark.parametrize("n", [2, FEW, FEW + 1, 30])
 @pytest.mark.parametrize("seed", range(5))
 def test_gcr_row_by_row_and_all_rows_together(n: int, seed: int) -> None:
