@@ -1,4 +1,6 @@
-"""How well the weights from a part of the minibatch agree with the exact ones, over a training run: ``gramian_samples``."""
+"""How well the weights from a part of the minibatch agree with the exact ones, over a training run:
+``gramian_samples``.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gcr import GCRPPO, RESOLVERS, RewardDecomposition
 from sb3_gcr.advantages import normalize_jointly
-from sb3_gcr.diagnostics import format_table
-from sb3_gcr.gradients import surrogate_cotangents
-from sb3_gcr.one_backward import OneBackward
+from sb3_gcr.gradients.by_hand import OneBackward
+from sb3_gcr.logs.shown import format_table
+from sb3_gcr.losses import surrogate_cotangents
 from sb3_gcr.resolvers import conflicts
 
 SIZES = (64, 128, 256, 512, 1024)
@@ -23,7 +25,9 @@ BATCH = 2048
 
 
 class Agreement(BaseCallback):
-    """After each rollout: exact Gramian and weights of one minibatch, and those of its first n samples."""
+    """After each rollout: exact Gramian and weights of one minibatch, and those of its first n
+    samples.
+    """
 
     def _on_training_start(self) -> None:
         self.figures: dict[int, list[tuple[float, float, float]]] = {size: [] for size in SIZES}
@@ -39,7 +43,12 @@ class Agreement(BaseCallback):
         rows = self.rng.permutation(buffer.buffer_size * buffer.n_envs)[:BATCH]
         advantages, observations, actions, log_probs = (
             th.as_tensor(buffer.swap_and_flatten(array)[rows])
-            for array in (normalize_jointly(buffer.advantages), buffer.observations, buffer.actions, buffer.log_probs)
+            for array in (
+                normalize_jointly(buffer.advantages),
+                buffer.observations,
+                buffer.actions,
+                buffer.log_probs,
+            )
         )
         networks = OneBackward(model.policy).evaluate(observations, actions)
         cotangents = surrogate_cotangents(networks.log_prob, log_probs.flatten(), advantages, 0.2)
@@ -49,7 +58,12 @@ class Agreement(BaseCallback):
             part = networks.gramian(cotangents, size).double().numpy()
             weights = RESOLVERS["gcr"](part, levels, np.random.default_rng(0))
             # Both steps with all samples, as GCRPPO takes them: ⟨Jᵀw, Jᵀv⟩ = wᵀ G v.
-            cosine = weights @ gramian @ exact / np.sqrt((weights @ gramian @ weights) * (exact @ gramian @ exact))
+            cosine = (
+                weights
+                @ gramian
+                @ exact
+                / np.sqrt((weights @ gramian @ weights) * (exact @ gramian @ exact))
+            )
             error = np.abs(weights - exact).mean() / np.abs(exact).mean()
             pairs = np.triu_indices(len(levels), 1)
             agree = (conflicts(part)[pairs] == conflicts(gramian)[pairs]).mean()
@@ -63,12 +77,27 @@ def main() -> None:
     parser.add_argument("--timesteps", type=int, default=100_000)
     arguments = parser.parse_args()
     th.set_num_threads(1)
-    env = VecNormalize(make_vec_env(arguments.env, n_envs=8, seed=0, wrapper_class=RewardDecomposition))
-    kwargs: dict[str, Any] = {"policy_kwargs": {"net_arch": [400, 200, 100]}, "device": "cpu", "seed": 0}
+    env = VecNormalize(
+        make_vec_env(arguments.env, n_envs=8, seed=0, wrapper_class=RewardDecomposition)
+    )
+    kwargs: dict[str, Any] = {
+        "policy_kwargs": {"net_arch": [400, 200, 100]},
+        "device": "cpu",
+        "seed": 0,
+    }
     model = GCRPPO("MlpPolicy", env, n_steps=512, batch_size=BATCH, n_epochs=10, **kwargs)
     callback = Agreement()
     model.learn(arguments.timesteps, callback=callback, progress_bar=True)
-    rows = [["samples", "of", "cosine of the steps: median", "lowest", "mean weight error", "pairs agreed on"]]
+    rows = [
+        [
+            "samples",
+            "of",
+            "cosine of the steps: median",
+            "lowest",
+            "mean weight error",
+            "pairs agreed on",
+        ]
+    ]
     for size, figures in callback.figures.items():
         cosines, errors, agreed = np.array(figures).T
         rows.append(
@@ -81,7 +110,10 @@ def main() -> None:
                 f"{np.mean(agreed):.0%}",
             ]
         )
-    print(f"{arguments.env}, {model.num_timesteps:,} steps, net 400×200×100, {len(model.reward_spec)} components")
+    print(
+        f"{arguments.env}, {model.num_timesteps:,} steps, net 400×200×100, "
+        f"{len(model.reward_spec)} components"
+    )
     print(format_table(rows))
 
 

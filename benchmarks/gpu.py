@@ -1,4 +1,6 @@
-"""Rows of one policy update on a GPU, with the sizes of the paper: 4096 envs, 24 steps, 4 minibatches."""
+"""Rows of one policy update on a GPU, with the sizes of the paper: 4096 envs, 24 steps, 4
+minibatches.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,17 @@ def cases(setting: Setting = GPU, gramian_samples: int = 2048) -> list[Case]:
     :param setting: what to update
     :param gramian_samples: size of the subset in the rows with one
     """
-    subset: dict[str, Any] = {"note": f" gramian_samples={gramian_samples}", "gramian_samples": gramian_samples}
+    subset: dict[str, Any] = {
+        "note": f" gramian_samples={gramian_samples}",
+        "gramian_samples": gramian_samples,
+    }
     rows = []
     for k in (7, 20):
         exact, few = partial(gcrppo, setting, k), partial(gcrppo, setting, k, **subset)
-        plain, flat = partial(gcrppo, setting, k, note=" sum", resolver="sum"), partial(FLAT, setting, k)
+        plain, flat = (
+            partial(gcrppo, setting, k, note=" sum", resolver="sum"),
+            partial(FLAT, setting, k),
+        )
         for subject, baseline, bar in (
             (few, plain, 1.15 if k == 20 else None),
             (exact, plain, 2.5 if k == 20 else None),

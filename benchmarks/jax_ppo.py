@@ -1,4 +1,6 @@
-"""``sbx.PPO``, scalar PPO compiled by JAX, on the same rollout; sbx is imported when it is needed, because it is optional."""
+"""``sbx.PPO``, scalar PPO compiled by JAX, on the same rollout; sbx is imported when it is needed,
+because it is optional.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +19,11 @@ def sbx_ppo() -> Any:
 
 
 def sbx_update(setting: Setting, n_components: int) -> Contestant:
-    """``train()`` of ``sbx.PPO`` on the summed advantages, always from the same weights, with the same minibatches.
+    """``train()`` of ``sbx.PPO`` on the summed advantages, always from the same weights, with the
+    same minibatches.
 
-    sbx keeps weights and optimiser in two immutable flax ``TrainState`` of its policy, ``actor_state`` and ``vf_state``.
+    sbx keeps weights and optimiser in two immutable flax ``TrainState`` of its policy,
+    ``actor_state`` and ``vf_state``.
     """
     jax = importlib.import_module("jax")
     model = make_model(sbx_ppo(), setting, n_components)

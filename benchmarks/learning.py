@@ -19,8 +19,12 @@ ENV_ID = "Humanoid-v5"
 N_ENVS, N_STEPS = 8, 256
 
 
-def learning(label: str, algorithm: Any, wrapper: type[gym.Wrapper[Any, Any, Any, Any]] | None = None) -> Contestant:
-    """Rollout and update of SB3's default sizes, envs stepped one after the other by a ``DummyVecEnv``."""
+def learning(
+    label: str, algorithm: Any, wrapper: type[gym.Wrapper[Any, Any, Any, Any]] | None = None
+) -> Contestant:
+    """Rollout and update of SB3's default sizes, envs stepped one after the other by a
+    ``DummyVecEnv``.
+    """
     env = make_vec_env(ENV_ID, N_ENVS, seed=SEED, wrapper_class=wrapper)
     model = algorithm("MlpPolicy", env, n_steps=N_STEPS, seed=SEED, device="cpu")
     model.set_logger(configure(None, []))

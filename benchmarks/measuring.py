@@ -40,7 +40,9 @@ def _no_rate() -> float | None:
 
 @dataclass(frozen=True)
 class Contestant:
-    """Something that costs: ``measure`` returns one figure, in seconds or bytes, smaller is better."""
+    """Something that costs: ``measure`` returns one figure, in seconds or bytes, smaller is
+    better.
+    """
 
     label: str
     measure: Callable[[], float]
@@ -100,14 +102,20 @@ class Row:
 
 
 def timed(
-    run: Callable[[], object], prepare: Callable[[], None] = _nothing, calls: int = 1, device: str = "cpu"
+    run: Callable[[], object],
+    prepare: Callable[[], None] = _nothing,
+    calls: int = 1,
+    device: str = "cpu",
 ) -> Callable[[], float]:
-    """A ``measure`` for :class:`Contestant`: seconds of ``run`` divided by ``calls``, without those of ``prepare``."""
+    """A ``measure`` for :class:`Contestant`: seconds of ``run`` divided by ``calls``, without those
+    of ``prepare``.
+    """
 
     def measure() -> float:
         prepare()
         synchronize(device)
-        # As timeit does: a collection that happens to fall into one of the two would be charged to it alone.
+        # As timeit does: a collection that happens to fall into one of the two would be charged to
+        # it alone.
         gc.disable()
         try:
             start = time.perf_counter()
@@ -129,7 +137,9 @@ def synchronize(device: str) -> None:
 def missing(case: Case) -> str | None:
     """The sentence that says why a case cannot run here, or None."""
     for need in case.needs:
-        found = th.cuda.is_available() if need == "cuda" else importlib.util.find_spec(need) is not None
+        found = (
+            th.cuda.is_available() if need == "cuda" else importlib.util.find_spec(need) is not None
+        )
         if not found:
             return NEEDS[need]
     return None
@@ -146,7 +156,8 @@ def measure_pairs(case: Case, pairs: int, seconds: float, report: Callable[[int]
     subject, baseline = case.subject(), case.baseline()
     wanted = min(pairs, case.max_pairs or pairs)
     if case.warm_up:
-        # The first measurement allocates, builds optimiser states, and compiles where there is a compiler.
+        # The first measurement allocates, builds optimiser states, and compiles where there is a
+        # compiler.
         baseline.measure()
         subject.measure()
     subject_values: list[float] = []

@@ -1,4 +1,6 @@
-"""Rows of peak memory over K at one million parameters; run as a module it is one of the measured processes."""
+"""Rows of peak memory over K at one million parameters; run as a module it is one of the measured
+processes.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,22 @@ MILLION = Setting({"pi": [833, 833], "vf": [64, 64]}, batch_size=256, n_samples=
 
 
 def peak_of_process(n_components: int, method: str | None = None) -> Contestant:
-    """Peak resident memory in bytes of a process that imports, builds a model, and updates it twice."""
+    """Peak resident memory in bytes of a process that imports, builds a model, and updates it
+    twice.
+    """
     arguments = [str(n_components), *(["--method", method] if method else [])]
-    # Linux lets a new program inherit the peak of the process that started it, hence the small shell in between.
-    command = ["sh", "-c", '"$@"; exit $?', "sh", sys.executable, "-m", "benchmarks.memory", *arguments]
+    # Linux lets a new program inherit the peak of the process that started it, hence the small
+    # shell in between.
+    command = [
+        "sh",
+        "-c",
+        '"$@"; exit $?',
+        "sh",
+        sys.executable,
+        "-m",
+        "benchmarks.memory",
+        *arguments,
+    ]
 
     def measure() -> float:
         process = subprocess.run(command, capture_output=True, text=True)
@@ -37,7 +51,10 @@ def cases() -> list[Case]:
     one = partial(peak_of_process, 1)
     return [
         Case("memory", "D=1M B=256", subject, one, bar, "MB", max_pairs=3, warm_up=False)
-        for subject, bar in ((partial(peak_of_process, 50), 1.2), (partial(peak_of_process, 50, "passes"), None))
+        for subject, bar in (
+            (partial(peak_of_process, 50), 1.2),
+            (partial(peak_of_process, 50, "passes"), None),
+        )
     ]
 
 

@@ -52,7 +52,11 @@ def buffer_by_buffer(n_components: int) -> Contestant:
 def resolver_alone(name: str, n_components: int) -> Contestant:
     """One resolver on Gramians with half of their pairs in conflict."""
     rng = np.random.default_rng(SEED)
-    signals = mixed_signals(GRAMIANS * SAMPLES, n_components, rng).reshape(GRAMIANS, SAMPLES, n_components).astype(float)
+    signals = (
+        mixed_signals(GRAMIANS * SAMPLES, n_components, rng)
+        .reshape(GRAMIANS, SAMPLES, n_components)
+        .astype(float)
+    )
     gramians = signals.mT @ signals
     levels = (2 * np.arange(n_components) >= n_components).astype(int)
     first, second = np.triu_indices(n_components, 1)
@@ -67,11 +71,18 @@ def resolver_alone(name: str, n_components: int) -> Contestant:
 
 
 def cases() -> list[Case]:
-    """All rows of this group; a resolver is compared with ``gcr``, which is compared with itself at K = 4."""
+    """All rows of this group; a resolver is compared with ``gcr``, which is compared with itself at
+    K = 4.
+    """
     sizes = (4, 10, 20)
     return [
         *(
-            Case("parts", f"GAE {STEPS}×{ENVS}", partial(component_gae_alone, k), partial(buffer_by_buffer, k))
+            Case(
+                "parts",
+                f"GAE {STEPS}×{ENVS}",
+                partial(component_gae_alone, k),
+                partial(buffer_by_buffer, k),
+            )
             for k in (1, 10, 50)
         ),
         *(

@@ -1,4 +1,6 @@
-"""Where the time of a minibatch goes: each part of GCRPPO's update repeated alone; ``python -m benchmarks.pieces``."""
+"""Where the time of a minibatch goes: each part of GCRPPO's update repeated alone; ``python -m
+benchmarks.pieces``.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ import torch as th
 from benchmarks.rollouts import Setting, evaluate, fill_buffer, make_model, make_rollout
 from benchmarks.updates import LARGE_2048, SMALL, SMALL_256
 from sb3_gcr import GCRPPO, RESOLVERS
-from sb3_gcr.diagnostics import format_table
-from sb3_gcr.gradients import surrogate_cotangents, value_cotangents
-from sb3_gcr.one_backward import OneBackward
+from sb3_gcr.gradients.by_hand import OneBackward
+from sb3_gcr.logs.shown import format_table
+from sb3_gcr.losses import surrogate_cotangents, value_cotangents
 
 SETTINGS = [(SMALL, 4), (SMALL, 20), (SMALL_256, 10), (LARGE_2048, 10)]
 ROUNDS = 7
@@ -41,7 +43,9 @@ def pieces(setting: Setting, n_components: int) -> dict[str, float]:
     rollout = make_rollout(setting, n_components)
     fill_buffer(model.rollout_buffer, rollout, *evaluate(model.policy, rollout))
     batch = next(iter(model.rollout_buffer.get(setting.batch_size)))
-    networks = OneBackward(model.policy, setting.batch_size).evaluate(batch.observations, batch.actions)
+    networks = OneBackward(model.policy, setting.batch_size).evaluate(
+        batch.observations, batch.actions
+    )
     old_values, returns = networks.array(batch.old_values), networks.array(batch.returns)
     arguments = (networks.array(batch.old_log_prob), networks.array(batch.advantages), 0.2)
     cotangents = surrogate_cotangents(networks.log_prob, *arguments)
@@ -58,12 +62,19 @@ def pieces(setting: Setting, n_components: int) -> dict[str, float]:
     n_batches = setting.n_samples // setting.batch_size
     with networks.one_thread():
         return {
-            "minibatch from the rollout": microseconds(lambda: list(model.rollout_buffer.get(setting.batch_size))) / n_batches,
-            "forward pass": microseconds(lambda: networks.evaluate(batch.observations, batch.actions)),
+            "minibatch from the rollout": microseconds(
+                lambda: list(model.rollout_buffer.get(setting.batch_size))
+            )
+            / n_batches,
+            "forward pass": microseconds(
+                lambda: networks.evaluate(batch.observations, batch.actions)
+            ),
             "derivatives of the losses": microseconds(derivatives),
             "signals and Gramian": microseconds(lambda: networks.gramian(cotangents)),
             "resolver": microseconds(lambda: RESOLVERS["gcr"](gramian, levels, rng)),
-            "backward pass": microseconds(lambda: networks.backward(cotangents.sum(1), value_gradients, 0.0)),
+            "backward pass": microseconds(
+                lambda: networks.backward(cotangents.sum(1), value_gradients, 0.0)
+            ),
             "norm and clip": microseconds(lambda: networks.clip_gradients(0.5)),
             "Adam": microseconds(model.policy.optimizer.step),
         }

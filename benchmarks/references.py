@@ -1,4 +1,6 @@
-"""Other ways to the same update, for comparison: K losses spelled out, and two ways to turn them into one gradient."""
+"""Other ways to the same update, for comparison: K losses spelled out, and two ways to turn them
+into one gradient.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,11 @@ from sb3_gcr import GCRPPO
 
 
 class LossByLoss(GCRPPO):
-    """GCRPPO whose update computes one surrogate loss per component and leaves their gradients to a subclass.
+    """GCRPPO whose update computes one surrogate loss per component and leaves their gradients to a
+    subclass.
 
-    Actor and critic must not share parameters. Less is logged than GCRPPO logs, which is to its advantage.
+    Actor and critic must not share parameters. Less is logged than GCRPPO logs, which is to its
+    advantage.
     """
 
     def train(self) -> None:
@@ -26,7 +30,9 @@ class LossByLoss(GCRPPO):
         self.clip_eps = float(self.clip_range(1.0))  # type: ignore[operator]
         self.levels = np.array(self.reward_spec.levels)
         self.rng = np.random.default_rng(self.seed)
-        self.actor = [weight for name, weight in self.policy.named_parameters() if "value" not in name]
+        self.actor = [
+            weight for name, weight in self.policy.named_parameters() if "value" not in name
+        ]
         advantages = self.rollout_buffer.advantages.reshape(-1, self.n_objectives)
         scale = advantages.sum(1).std(ddof=1) + 1e-8
         normalized = (advantages - advantages.mean(0)) / scale
@@ -37,7 +43,9 @@ class LossByLoss(GCRPPO):
         self._n_updates += self.n_epochs
 
     def train_minibatch(self, batch: Any) -> None:
-        """One optimiser step: the resolved gradient of the actor, the plain one of critic and entropy."""
+        """One optimiser step: the resolved gradient of the actor, the plain one of critic and
+        entropy.
+        """
         values, log_prob, entropy = self.policy.evaluate_actions(batch.observations, batch.actions)
         ratio = th.exp(log_prob - batch.old_log_prob).unsqueeze(1)
         clipped = ratio.clamp(1 - self.clip_eps, 1 + self.clip_eps)
@@ -51,12 +59,16 @@ class LossByLoss(GCRPPO):
         self.policy.optimizer.step()
 
     def backward_actor(self, losses: th.Tensor) -> None:
-        """Put the gradient that K losses, shape (K,), resolve to into the actor's ``grad``; the graph is not kept."""
+        """Put the gradient that K losses, shape (K,), resolve to into the actor's ``grad``; the
+        graph is not kept.
+        """
         raise NotImplementedError
 
 
 class FlatProjection(LossByLoss):
-    """K backward passes to K flat gradients, projected pair by pair where they lie, as in the authors' release."""
+    """K backward passes to K flat gradients, projected pair by pair where they lie, as in the
+    authors' release.
+    """
 
     def backward_actor(self, losses: th.Tensor) -> None:
         """Flatten, project, unflatten."""
@@ -70,8 +82,12 @@ class FlatProjection(LossByLoss):
             weight.grad = piece.view_as(weight)
 
 
-def project_in_place(gradients: Sequence[th.Tensor], levels: NDArray[Any], rng: np.random.Generator) -> th.Tensor:
-    """Project each gradient off the tasks that it conflicts with as they are by then, and add up; (K times (D,)) -> (D,)."""
+def project_in_place(
+    gradients: Sequence[th.Tensor], levels: NDArray[Any], rng: np.random.Generator
+) -> th.Tensor:
+    """Project each gradient off the tasks that it conflicts with as they are by then, and add up;
+    (K times (D,)) -> (D,).
+    """
     for i in rng.permutation(len(gradients)):
         for j in rng.permutation(len(gradients)):
             if i == j or levels[j] > 0:
@@ -83,7 +99,9 @@ def project_in_place(gradients: Sequence[th.Tensor], levels: NDArray[Any], rng: 
 
 
 class Autojac(LossByLoss):
-    """TorchJD's Jacobian descent: one vmapped backward to the K×D Jacobian, then its PCGrad, which knows no levels."""
+    """TorchJD's Jacobian descent: one vmapped backward to the K×D Jacobian, then its PCGrad, which
+    knows no levels.
+    """
 
     def backward_actor(self, losses: th.Tensor) -> None:
         """Jacobian, then aggregation."""

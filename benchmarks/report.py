@@ -32,8 +32,10 @@ PACKAGES = (
 #: Columns of the table that hold words.
 WORDS = 4
 EXPLANATION = (
-    "ratio: time or memory of the row over that of what it is compared with, below 1 is cheaper; median of interleaved pairs, "
-    "then their quartiles.\nconflicts: share of component pairs whose gradients point against each other, half by design."
+    "ratio: time or memory of the row over that of what it is compared with, below 1 is cheaper; "
+    "median of interleaved pairs, "
+    "then their quartiles.\nconflicts: share of component pairs whose gradients point against each "
+    "other, half by design."
 )
 
 
@@ -62,10 +64,15 @@ def _cpu_name() -> str:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.processor())
+    return next(
+        (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")),
+        platform.processor(),
+    )
 
 
-def save(path: Path, machine: Mapping[str, Any], rows: Sequence[Row], absent: Sequence[str]) -> None:
+def save(
+    path: Path, machine: Mapping[str, Any], rows: Sequence[Row], absent: Sequence[str]
+) -> None:
     """Write everything that was measured as JSON.
 
     :param path: file to write
@@ -73,7 +80,12 @@ def save(path: Path, machine: Mapping[str, Any], rows: Sequence[Row], absent: Se
     :param rows: all rows
     :param absent: one sentence for each reason why rows are missing
     """
-    path.write_text(json.dumps({"machine": machine, "rows": [asdict(row) for row in rows], "absent": absent}, indent=1) + "\n")
+    path.write_text(
+        json.dumps(
+            {"machine": machine, "rows": [asdict(row) for row in rows], "absent": absent}, indent=1
+        )
+        + "\n"
+    )
 
 
 def load(path: Path) -> tuple[dict[str, Any], list[Row], list[str]]:
@@ -88,7 +100,19 @@ def table(rows: Sequence[Row], earlier: Sequence[Row] | None = None) -> str:
     :param rows: at least one
     :param earlier: rows of another run; adds its ratios and how much each has changed
     """
-    head = ["group", "setting", "row", "compared with", "measured", "other", "unit", "ratio", "quartiles", "conflicts", "bar"]
+    head = [
+        "group",
+        "setting",
+        "row",
+        "compared with",
+        "measured",
+        "other",
+        "unit",
+        "ratio",
+        "quartiles",
+        "conflicts",
+        "bar",
+    ]
     if earlier is not None:
         head += ["earlier", "change"]
     before = {row.name: row.ratio for row in earlier or ()}
@@ -97,7 +121,11 @@ def table(rows: Sequence[Row], earlier: Sequence[Row] | None = None) -> str:
         cells = _cells(row)
         if earlier is not None:
             ratio = before.get(row.name)
-            cells += ["", ""] if ratio is None else [f"{ratio:.2f}", f"{100 * (row.ratio / ratio - 1):+.0f} %"]
+            cells += (
+                ["", ""]
+                if ratio is None
+                else [f"{ratio:.2f}", f"{100 * (row.ratio / ratio - 1):+.0f} %"]
+            )
         lines.append(cells)
     return _aligned(lines)
 
@@ -126,7 +154,10 @@ def _number(value: float) -> str:
 def _aligned(lines: Sequence[Sequence[str]]) -> str:
     widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
     aligned = [
-        "  ".join(c.ljust(w) if i < WORDS else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths, strict=True)))
+        "  ".join(
+            c.ljust(w) if i < WORDS else c.rjust(w)
+            for i, (c, w) in enumerate(zip(line, widths, strict=True))
+        )
         for line in lines
     ]
     return "\n".join([aligned[0], "-" * len(aligned[0]), *aligned[1:]])

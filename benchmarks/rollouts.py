@@ -19,9 +19,11 @@ from sb3_gcr import RewardSpec
 Array = NDArray[Any]
 
 SEED = 0
-#: Shared random signals that the component advantages are mixed from; even, so that a pair can also be orthogonal.
+#: Shared random signals that the component advantages are mixed from; even, so that a pair can also
+#: be orthogonal.
 SIGNALS = 4
-#: Draws of the sign pattern, of which the one with nearest to one half of conflicting pairs is taken.
+#: Draws of the sign pattern, of which the one with nearest to one half of conflicting pairs is
+#: taken.
 DRAWS = 500
 #: Standard deviation of each component's own noise, in units of that of its mixture.
 NOISE = 0.5
@@ -41,14 +43,17 @@ class Setting:
 
     def __str__(self) -> str:
         net = "×".join(map(str, self.net)) if isinstance(self.net, tuple) else str(self.net)
-        return f"{net} B={self.batch_size}" + ("" if self.obs_size == 348 else f" obs {self.obs_size}")
+        return f"{net} B={self.batch_size}" + (
+            "" if self.obs_size == 348 else f" obs {self.obs_size}"
+        )
 
 
 class StubEnv(gym.Env[Array, Array]):
     """Spaces and names only: what a model needs to be made, no physics.
 
     :param setting: sizes of observation and action
-    :param n_components: number K of reward components, the first half of them tasks, the others regularisers
+    :param n_components: number K of reward components, the first half of them tasks, the others
+        regularisers
     """
 
     def __init__(self, setting: Setting, n_components: int):
@@ -59,20 +64,28 @@ class StubEnv(gym.Env[Array, Array]):
             tuple(int(2 * k >= n_components) for k in range(n_components)),
         )
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
         """An observation of zeros."""
         return np.zeros(self.observation_space.shape or (), np.float32), {}
 
 
 def mixed_signals(n_samples: int, n_components: int, rng: np.random.Generator) -> Array:
-    """Random signals, one per component, of which half of the pairs point against each other, shape (n_samples, K).
+    """Random signals, one per component, of which half of the pairs point against each other, shape
+    (n_samples, K).
 
-    Two components with sign patterns p, q over shared signals agree where ⟨p, q⟩ > 0, clash where it is < 0, and do either,
-    minibatch by minibatch, where it is 0. The pattern is drawn so that clashes make up one half; one pair gets ⟨p, q⟩ = 0.
+    Two components with sign patterns p, q over shared signals agree where ⟨p, q⟩ > 0, clash where
+    it is < 0, and do either, minibatch by minibatch, where it is 0. The pattern is drawn so that
+    clashes make up one half; one pair gets ⟨p, q⟩ = 0.
     """
     patterns = rng.choice([-1.0, 1.0], (DRAWS, SIGNALS, n_components))
     first, second = np.triu_indices(n_components, 1)
-    inner = np.einsum("dsi,dsi->di", patterns[..., first], patterns[..., second]) if n_components > 1 else np.zeros((DRAWS, 1))
+    inner = (
+        np.einsum("dsi,dsi->di", patterns[..., first], patterns[..., second])
+        if n_components > 1
+        else np.zeros((DRAWS, 1))
+    )
     share = (inner < 0).mean(1) + (inner == 0).mean(1) / 2
     pattern = patterns[np.argmin(np.abs(share - 0.5))] / np.sqrt(SIGNALS)
     shared = rng.standard_normal((n_samples, SIGNALS)) @ pattern
@@ -99,7 +112,9 @@ def make_rollout(setting: Setting, n_components: int) -> Rollout:
 
 
 def fill_buffer(buffer: Any, rollout: Rollout, values: Array, log_probs: Array) -> None:
-    """Put a rollout into a model's buffer, whole: a scalar algorithm gets the sum of the components' advantages."""
+    """Put a rollout into a model's buffer, whole: a scalar algorithm gets the sum of the
+    components' advantages.
+    """
     advantages = rollout.advantages.reshape(len(values), -1)
     if values.shape[1] == 1:
         advantages = advantages.sum(1, keepdims=True)
@@ -118,8 +133,12 @@ def fill_buffer(buffer: Any, rollout: Rollout, values: Array, log_probs: Array) 
     buffer.pos, buffer.full = buffer.buffer_size, True
 
 
-def make_model(algorithm: Callable[..., OnPolicyAlgorithm], setting: Setting, n_components: int, **kwargs: Any) -> Any:
-    """A model of SB3's constructor arguments with SB3's defaults, but for sizes, seed and a silent logger."""
+def make_model(
+    algorithm: Callable[..., OnPolicyAlgorithm], setting: Setting, n_components: int, **kwargs: Any
+) -> Any:
+    """A model of SB3's constructor arguments with SB3's defaults, but for sizes, seed and a silent
+    logger.
+    """
     net = list(setting.net) if isinstance(setting.net, tuple) else setting.net
     model = algorithm(
         "MlpPolicy",
@@ -140,14 +159,22 @@ def evaluate(policy: Any, rollout: Rollout) -> tuple[Array, Array]:
     """Values, shape (n, K), and log π, shape (n,), of a PyTorch policy on the rollout."""
     with th.no_grad():
         observations = th.as_tensor(rollout.observations, device=policy.device)
-        values, log_probs, _ = policy.evaluate_actions(observations, th.as_tensor(rollout.actions, device=policy.device))
+        values, log_probs, _ = policy.evaluate_actions(
+            observations, th.as_tensor(rollout.actions, device=policy.device)
+        )
     return values.reshape(len(log_probs), -1).cpu().numpy(), log_probs.cpu().numpy()
 
 
 def torch_update(
-    label: str, algorithm: Callable[..., OnPolicyAlgorithm], setting: Setting, n_components: int, **kwargs: Any
+    label: str,
+    algorithm: Callable[..., OnPolicyAlgorithm],
+    setting: Setting,
+    n_components: int,
+    **kwargs: Any,
 ) -> Contestant:
-    """``train()`` of a PyTorch algorithm on the synthetic rollout, always from the same weights, with the same minibatches."""
+    """``train()`` of a PyTorch algorithm on the synthetic rollout, always from the same weights,
+    with the same minibatches.
+    """
     model = make_model(algorithm, setting, n_components, **kwargs)
     rollout = make_rollout(setting, n_components)
     values, log_probs = evaluate(model.policy, rollout)

@@ -1,4 +1,5 @@
-"""Rows of the envs: what a step costs beside the physics, and whole ``learn()`` runs on many robots.
+"""Rows of the envs: what a step costs beside the physics, and whole ``learn()`` runs on many
+robots.
 
 Run as a module, with the name of a task, it prints the memory of one more simulation.
 """
@@ -26,7 +27,7 @@ from benchmarks.rollouts import SEED
 from sb3_gcr import GCRPPO
 from sb3_gcr.envs import BatchedVecEnv, EnvPoolVecEnv
 from sb3_gcr.envs.task import Rows
-from sb3_gcr.envs.tasks import make_task
+from sb3_gcr.envs.tasks.catalogue import make_task
 
 N_THREADS = 2
 #: Steps of all robots in one measurement, and in between before the first.
@@ -55,7 +56,9 @@ def stepping(label: str, step: Callable[[], object], n_envs: int) -> Contestant:
     """Seconds per step of one robot."""
     for _ in range(N_SETTLE):
         step()
-    return Contestant(label, timed(lambda: [step() for _ in range(N_STEPS)], calls=N_STEPS * n_envs))
+    return Contestant(
+        label, timed(lambda: [step() for _ in range(N_STEPS)], calls=N_STEPS * n_envs)
+    )
 
 
 def full_step(name: str, n_envs: int) -> Contestant:
@@ -94,23 +97,35 @@ def bare_step(name: str, n_envs: int) -> Contestant:
 
 def envpool_step(env_id: str, n_envs: int) -> Contestant:
     """EnvPool's own loop."""
-    pool: Any = importlib.import_module("envpool").make(env_id, "gymnasium", num_envs=n_envs, num_threads=N_THREADS, seed=SEED)
+    pool: Any = importlib.import_module("envpool").make(
+        env_id, "gymnasium", num_envs=n_envs, num_threads=N_THREADS, seed=SEED
+    )
     pool.reset()
     actions = random_actions(n_envs, pool.action_space.low, pool.action_space.high)
-    return stepping(f"EnvPool {env_id}", lambda: pool.step(next(actions).astype(pool.action_space.dtype)), n_envs)
+    return stepping(
+        f"EnvPool {env_id}",
+        lambda: pool.step(next(actions).astype(pool.action_space.dtype)),
+        n_envs,
+    )
 
 
-def learning(label: str, algorithm: Any, make_env: Callable[[], VecEnv], **arguments: Any) -> Contestant:
+def learning(
+    label: str, algorithm: Any, make_env: Callable[[], VecEnv], **arguments: Any
+) -> Contestant:
     """One rollout and its update, seconds per env step."""
     env = make_env()
     model = algorithm("MlpPolicy", env, seed=SEED, device="cpu", **arguments)
     model.set_logger(configure(None, []))
     steps = env.num_envs * arguments["n_steps"]
-    return Contestant(label, timed(partial(model.learn, steps, reset_num_timesteps=False), calls=steps))
+    return Contestant(
+        label, timed(partial(model.learn, steps, reset_num_timesteps=False), calls=steps)
+    )
 
 
 def envpool_learning(n_envs: int) -> Contestant:
-    """GCRPPO on EnvPool's Humanoid, four terms; the rollout has 2048 steps, as that of PPO on 8 envs."""
+    """GCRPPO on EnvPool's Humanoid, four terms; the rollout has 2048 steps, as that of PPO on 8
+    envs.
+    """
     make_env = partial(EnvPoolVecEnv, "Humanoid-v5", n_envs, N_THREADS)
     return learning(f"GCRPPO, {n_envs} in EnvPool", GCRPPO, make_env, n_steps=2048 // n_envs)
 
@@ -124,15 +139,33 @@ def humanoid_learning() -> Contestant:
 def cases() -> list[Case]:
     """All rows of this group."""
     rows = [
-        Case("envs", f"{name}, {n} robots", partial(full_step, name, n), partial(bare_step, name, n), 1 / 0.75, "steps/s")
+        Case(
+            "envs",
+            f"{name}, {n} robots",
+            partial(full_step, name, n),
+            partial(bare_step, name, n),
+            1 / 0.75,
+            "steps/s",
+        )
         for name, n in (("HalfCheetah", 64), ("Hopper", 64), ("Walker2d", 64), ("HumanoidRun", 256))
     ]
-    humanoid, pool = partial(full_step, "HumanoidRun", 256), partial(envpool_step, "Humanoid-v5", 256)
+    humanoid, pool = (
+        partial(full_step, "HumanoidRun", 256),
+        partial(envpool_step, "Humanoid-v5", 256),
+    )
     rows.append(Case("envs", "256 humanoids", humanoid, pool, 1 / 3, "steps/s", needs=("envpool",)))
-    ppo = partial(learning, "PPO, 8 in DummyVecEnv", PPO, partial(make_vec_env, "Humanoid-v5", 8, SEED), n_steps=256)
+    ppo = partial(
+        learning,
+        "PPO, 8 in DummyVecEnv",
+        PPO,
+        partial(make_vec_env, "Humanoid-v5", 8, SEED),
+        n_steps=256,
+    )
     for n, bar in ((256, 0.5), (64, None)):
         subject = partial(envpool_learning, n)
-        rows.append(Case("envs", "learn() on Humanoid-v5", subject, ppo, bar, "steps/s", needs=("envpool",)))
+        rows.append(
+            Case("envs", "learn() on Humanoid-v5", subject, ppo, bar, "steps/s", needs=("envpool",))
+        )
     bare = partial(bare_step, "HumanoidRun", 256)
     rows.append(Case("envs", "learn(), 256 robots", humanoid_learning, bare, unit="steps/s"))
     return rows
@@ -154,4 +187,6 @@ def memory_of_a_simulation(name: str) -> float:
 
 
 if __name__ == "__main__":
-    print(f"{memory_of_a_simulation(sys.argv[1]) / 1e3:.1f} kB for each simulation of {sys.argv[1]}")
+    print(
+        f"{memory_of_a_simulation(sys.argv[1]) / 1e3:.1f} kB for each simulation of {sys.argv[1]}"
+    )

@@ -37,7 +37,9 @@ def gcrppo(setting: Setting, n_components: int, note: str = "", **kwargs: Any) -
     return torch_update(f"GCRPPO K={n_components}{note}", GCRPPO, setting, n_components, **kwargs)
 
 
-def reference(algorithm: type[GCRPPO], label: str, setting: Setting, n_components: int) -> Contestant:
+def reference(
+    algorithm: type[GCRPPO], label: str, setting: Setting, n_components: int
+) -> Contestant:
     """One of the reference updates."""
     return torch_update(f"{label} K={n_components}", algorithm, setting, n_components)
 
@@ -77,7 +79,10 @@ OTHERS: list[tuple[Setting, int, Maker, str | None, float | None]] = [
     (LARGE_2048, 10, FLAT, None, None),
     *((SMALL, k, AUTOJAC, "torchjd", None) for k in (4, 10, 20)),
     (SMALL_256, 10, AUTOJAC, "torchjd", None),
-    *((setting, 4, sbx_update, "sbx", None) for setting in (SMALL, SMALL_256, MIDDLE_256, LARGE_2048)),
+    *(
+        (setting, 4, sbx_update, "sbx", None)
+        for setting in (SMALL, SMALL_256, MIDDLE_256, LARGE_2048)
+    ),
 ]
 
 
@@ -85,7 +90,11 @@ def cases() -> list[Case]:
     """All rows of this group."""
 
     def case(
-        setting: Setting, subject: Callable[[], Contestant], baseline: Callable[[], Contestant], *needs: str, bar: float | None
+        setting: Setting,
+        subject: Callable[[], Contestant],
+        baseline: Callable[[], Contestant],
+        *needs: str,
+        bar: float | None,
     ) -> Case:
         return Case("update", str(setting), subject, baseline, bar, needs=needs)
 

@@ -29,7 +29,8 @@ exclude_patterns = ["_build", "inventories"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
-# Types stand beside the parameters, where the docstrings explain them; defaults as they are written in the source.
+# Types stand beside the parameters, where the docstrings explain them; defaults as they are written
+# in the source.
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 autodoc_type_aliases = {
@@ -41,9 +42,13 @@ autodoc_member_order = "bysource"
 python_use_unqualified_type_names = True
 
 # Type variables have no page.
-nitpick_ignore = [("py:class", "sb3_gcr.gcrppo.SelfGCRPPO"), ("py:class", "sb3_gcr.advantages.ArrayT")]
-# Every reference to a name of ours must resolve. Those of other projects do where a file in inventories/ lists them: short
-# files of our own, in Sphinx' oldest and readable format, because a build must not depend on the network.
+nitpick_ignore = [
+    ("py:class", "sb3_gcr.gcrppo.SelfGCRPPO"),
+    ("py:class", "sb3_gcr.advantages.ArrayT"),
+]
+# Every reference to a name of ours must resolve. Those of other projects do where a file in
+# inventories/ lists them: short files of our own, in Sphinx' oldest and readable format, because a
+# build must not depend on the network.
 nitpick_ignore_regex = [("py:.*", r"(?!sb3_gcr).*")]
 intersphinx_mapping = {
     name: (url, f"inventories/{name}.inv")
@@ -56,7 +61,8 @@ intersphinx_mapping = {
     }.items()
 }
 
-# Furo and not SB3's sphinx_rtd_theme: wide tables scroll by themselves in a narrow window, and it has a dark mode.
+# Furo and not SB3's sphinx_rtd_theme: wide tables scroll by themselves in a narrow window, and it
+# has a dark mode.
 html_theme = "furo"
 html_title = f"sb3_gcr {version}"
 html_static_path = ["_static"]

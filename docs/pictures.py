@@ -1,4 +1,6 @@
-"""The pictures of method.md and logs.md: ``python docs/pictures.py`` makes them again in a few minutes."""
+"""The pictures of method.md and logs.md: ``python docs/pictures.py`` makes them again in a few
+minutes.
+"""
 
 from __future__ import annotations
 
@@ -26,16 +28,27 @@ BLUE, ORANGE, GREY, RED = "#1f6fb4", "#d9730d", "#8a8a8a", "#b3261e"
 
 
 def all_steps(resolver: str) -> list[NDArray[np.float64]]:
-    """The different steps that a resolver takes in the example, over the random orders of its projections."""
+    """The different steps that a resolver takes in the example, over the random orders of its
+    projections.
+    """
     draws = [
-        RESOLVERS[resolver](GRADIENTS @ GRADIENTS.T, LEVELS, np.random.default_rng(seed)) @ GRADIENTS for seed in range(50)
+        RESOLVERS[resolver](GRADIENTS @ GRADIENTS.T, LEVELS, np.random.default_rng(seed))
+        @ GRADIENTS
+        for seed in range(50)
     ]
     return [np.array(step) for step in sorted({tuple(np.round(step, 6)) for step in draws})]
 
 
-def arrow(axis: Axes, vector: NDArray[np.float64], colour: str, label: str, width: float = 1.6) -> None:
+def arrow(
+    axis: Axes, vector: NDArray[np.float64], colour: str, label: str, width: float = 1.6
+) -> None:
     """A vector from the origin, with its name beside the tip."""
-    axis.annotate("", xy=tuple(vector), xytext=(0, 0), arrowprops={"arrowstyle": "-|>", "color": colour, "lw": width})
+    axis.annotate(
+        "",
+        xy=tuple(vector),
+        xytext=(0, 0),
+        arrowprops={"arrowstyle": "-|>", "color": colour, "lw": width},
+    )
     away = vector + 0.2 * vector / np.linalg.norm(vector)
     axis.text(away[0], away[1], label, color=colour, ha="center", va="center", fontsize=10)
 
@@ -44,7 +57,8 @@ def counterexample() -> Figure:
     """Where the steps of three resolvers lead when two tasks conflict."""
     figure = Figure(figsize=(10.5, 3.6), layout="constrained")
     for axis, resolver in zip(figure.subplots(1, 3), ("sum", "gcr", "guaranteed"), strict=True):
-        # No task gets worse where both inner products are >= 0: between the directions (0, 1) and (0.8, 0.6).
+        # No task gets worse where both inner products are >= 0: between the directions (0, 1) and
+        # (0.8, 0.6).
         axis.add_patch(Polygon([(0, 0), (0, 9), (12, 9)], color="#bfe3c6", zorder=0))
         arrow(axis, GRADIENTS[0], BLUE, "$t_1$")
         arrow(axis, GRADIENTS[1], BLUE, "$t_2$")
@@ -55,9 +69,23 @@ def counterexample() -> Figure:
             harm = f"against ${', '.join(worse)}$" if worse else "no task\ngets worse"
             x, y = (-1.5, -0.9) if resolver == "sum" else step
             side, gap = ("left", 0.12) if x > 0 else ("right", -0.12)
-            axis.text(x + gap, y, f"({step[0]:.2f}, {step[1]:.2f})\n{harm}", color=RED, ha=side, va="center", fontsize=9)
+            axis.text(
+                x + gap,
+                y,
+                f"({step[0]:.2f}, {step[1]:.2f})\n{harm}",
+                color=RED,
+                ha=side,
+                va="center",
+                fontsize=9,
+            )
         axis.set_title(f'resolver="{resolver}"', family="monospace", fontsize=11)
-        axis.set(xlim=(-3.6, 2.6), ylim=(-3.5, 2.1), aspect="equal", xticks=range(-3, 3), yticks=range(-3, 3))
+        axis.set(
+            xlim=(-3.6, 2.6),
+            ylim=(-3.5, 2.1),
+            aspect="equal",
+            xticks=range(-3, 3),
+            yticks=range(-3, 3),
+        )
         axis.axhline(0, color="#cccccc", lw=0.8, zorder=0.5)
         axis.axvline(0, color="#cccccc", lw=0.8, zorder=0.5)
     return figure
@@ -65,7 +93,9 @@ def counterexample() -> Figure:
 
 def training(timesteps: int, folder: str) -> EventAccumulator:
     """Train on HalfCheetah with a TensorBoard log, and read that."""
-    env = VecNormalize(make_vec_env("HalfCheetah-v5", n_envs=8, seed=0, wrapper_class=RewardDecomposition))
+    env = VecNormalize(
+        make_vec_env("HalfCheetah-v5", n_envs=8, seed=0, wrapper_class=RewardDecomposition)
+    )
     model = GCRPPO("MlpPolicy", env, n_steps=256, seed=0, device="cpu")
     model.set_logger(configure(folder, ["tensorboard"]))
     model.learn(timesteps)
@@ -87,7 +117,12 @@ def conflict(log: EventAccumulator) -> Figure:
             events = log.Scalars(key)
             name = key.rsplit("/", 1)[1]
             colour = {"reward_forward": BLUE, "reward_ctrl": ORANGE}.get(name, GREY)
-            axis.plot([event.step for event in events], [event.value for event in events], color=colour, label=name)
+            axis.plot(
+                [event.step for event in events],
+                [event.value for event in events],
+                color=colour,
+                label=name,
+            )
         axis.set_title(title, loc="left", family="monospace", fontsize=10)
         axis.grid(alpha=0.3)
         axis.xaxis.set_major_formatter(lambda steps, _: f"{steps / 1000:.0f}k")
@@ -101,15 +136,21 @@ def conflict(log: EventAccumulator) -> Figure:
 def main() -> None:
     """Make all pictures, or those that are named."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help="counterexample, conflict (default: both)")
-    parser.add_argument("--timesteps", type=int, default=100_000, help="of the training for `conflict`")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help="counterexample, conflict (default: both)"
+    )
+    parser.add_argument(
+        "--timesteps", type=int, default=100_000, help="of the training for `conflict`"
+    )
     arguments = parser.parse_args()
     names = arguments.names or ["counterexample", "conflict"]
     if "counterexample" in names:
         counterexample().savefig(IMAGES / "counterexample.png", dpi=130)
     if "conflict" in names:
         with tempfile.TemporaryDirectory() as folder:
-            conflict(training(arguments.timesteps, folder)).savefig(IMAGES / "conflict.png", dpi=130)
+            conflict(training(arguments.timesteps, folder)).savefig(
+                IMAGES / "conflict.png", dpi=130
+            )
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 from tqdm import tqdm
 
 from sb3_gcr import GCRPPO, RewardDecomposition, evaluate_components
-from sb3_gcr.components import GYMNASIUM_ENVS
-from sb3_gcr.diagnostics import format_table
+from sb3_gcr.logs.shown import format_table
+from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS
 
 #: Algorithms by the name in the table; all else is equal.
 METHODS: dict[str, dict[str, Any]] = {
@@ -33,7 +33,9 @@ EVAL_EPISODES = 20
 
 
 class Speed(BaseCallback):
-    """Keeps the return of the last episodes after each rollout: its mean over training is the learning speed."""
+    """Keeps the return of the last episodes after each rollout: its mean over training is the
+    learning speed.
+    """
 
     def _on_training_start(self) -> None:
         self.returns: list[float] = []
@@ -56,17 +58,28 @@ def run(job: tuple[str, str, int, int]) -> dict[str, Any]:
     model = algorithm("MlpPolicy", env, n_steps=256, seed=seed, device="cpu", **METHODS[method])
     speed = Speed()
     model.learn(timesteps, callback=speed)
-    evaluation_env = make_vec_env(env_id, n_envs=4, seed=1000 + seed, wrapper_class=RewardDecomposition)
+    evaluation_env = make_vec_env(
+        env_id, n_envs=4, seed=1000 + seed, wrapper_class=RewardDecomposition
+    )
     normalised = VecNormalize(evaluation_env, training=False, norm_reward=False)
     normalised.obs_rms = env.obs_rms
     result = evaluate_components(model, normalised, EVAL_EPISODES)
     final = {"return": result.mean_reward, **result.component_means}  # type: ignore[union-attr]
-    return {"method": method, "seed": seed, "during training": float(np.mean(speed.returns)), "final": final}
+    return {
+        "method": method,
+        "seed": seed,
+        "during training": float(np.mean(speed.returns)),
+        "final": final,
+    }
 
 
 def interval(values: list[float]) -> str:
     """Mean and the half-width of its 95 % confidence interval over seeds."""
-    half = student.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    half = (
+        student.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
+        if len(values) > 1
+        else np.nan
+    )
     return f"{np.mean(values):.0f} ± {half:.0f}"
 
 
@@ -84,7 +97,9 @@ def p_values(samples: dict[str, list[float]]) -> dict[str, str]:
 
 
 def table(results: list[dict[str, Any]]) -> str:
-    """One row per method: return during training and of the final policy with p values against PPO, then the components."""
+    """One row per method: return during training and of the final policy with p values against PPO,
+    then the components.
+    """
     runs = {name: [row for row in results if row["method"] == name] for name in METHODS}
     runs = {name: rows for name, rows in runs.items() if rows}
     training = {name: [row["during training"] for row in rows] for name, rows in runs.items()}
@@ -93,7 +108,12 @@ def table(results: list[dict[str, Any]]) -> str:
     components = [key for key in results[0]["final"] if key != "return"]
     lines = [["method", "seeds", "return in training", "p", "final return", "p", *components]]
     for name, rows in runs.items():
-        cells = [interval(training[name]), p_training.get(name, ""), interval(final[name]), p_final.get(name, "")]
+        cells = [
+            interval(training[name]),
+            p_training.get(name, ""),
+            interval(final[name]),
+            p_final.get(name, ""),
+        ]
         cells += [interval([row["final"][key] for row in rows]) for key in components]
         lines.append([name, str(len(rows)), *cells])
     return format_table(lines)
@@ -110,7 +130,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("logs/compare.json"))
     arguments = parser.parse_args()
     jobs = [
-        (arguments.env, method, seed, arguments.timesteps) for seed in range(arguments.seeds) for method in arguments.methods
+        (arguments.env, method, seed, arguments.timesteps)
+        for seed in range(arguments.seeds)
+        for method in arguments.methods
     ]
     results = []
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
@@ -118,7 +140,10 @@ def main() -> None:
         for result in tqdm(pool.imap_unordered(run, jobs), total=len(jobs), unit="run"):
             results.append(result)
             arguments.out.write_text(json.dumps(results, indent=1))
-    print(f"{arguments.env}, {arguments.timesteps:,} steps, {EVAL_EPISODES} deterministic episodes a seed")
+    print(
+        f"{arguments.env}, {arguments.timesteps:,} steps, {EVAL_EPISODES} deterministic episodes a "
+        "seed"
+    )
     print(table(results))
 
 

@@ -1,4 +1,5 @@
-"""Show that every range of every objective can be reached: the table of docs/tasks.md, with a pose or motion that pays.
+"""Show that every range of every objective can be reached: the table of docs/tasks.md, with a pose
+or motion that pays.
 
 Run ``python examples/reachability.py`` to print it.
 """
@@ -12,16 +13,16 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_gcr.envs import humanoid, throwing
 from sb3_gcr.envs.engine import Engine
 from sb3_gcr.envs.task import Task
+from sb3_gcr.envs.tasks import humanoid, throwing
 
 Array = NDArray[Any]
 
 #: Joints of a jump, and the sign of the left one where there are two.
 JUMP_JOINTS = (("hip_y", 1), ("knee", 1), ("abdomen_y", 0), ("shoulder1", -1), ("shoulder2", -1))
-#: Jumps of the humanoid: speed of the run-up [m/s], bent knees and torso at the start [°], and the torques of JUMP_JOINTS in
-#: percent, one row each tenth of a second. Found by a random search.
+#: Jumps of the humanoid: speed of the run-up [m/s], bent knees and torso at the start [°], and the
+#: torques of JUMP_JOINTS in percent, one row each tenth of a second. Found by a random search.
 JUMPS: tuple[dict[str, Any], ...] = (
     {
         "speed": 0,
@@ -154,24 +155,49 @@ def humanoid_motions() -> list[Motion]:
     for _ in range(100):
         qpos = standing()
         qpos[7:][arms] = rng.uniform(low[arms], high[arms])
-        motions.append(Motion("stand, arms at rest in a pose", qpos, still, np.zeros((0, model.nu))))
+        motions.append(
+            Motion("stand, arms at rest in a pose", qpos, still, np.zeros((0, model.nu)))
+        )
     for degrees in range(0, 150, 5):
-        motions.append(Motion(f"knees bent by {degrees}°", standing(np.deg2rad(degrees)), still, np.zeros((0, model.nu))))
+        motions.append(
+            Motion(
+                f"knees bent by {degrees}°",
+                standing(np.deg2rad(degrees)),
+                still,
+                np.zeros((0, model.nu)),
+            )
+        )
     time = np.arange(30)[:, None] / 60
     for amplitude in np.arange(0.05, 1.01, 0.05):
         swing = amplitude * np.sin(2 * np.pi * (2 * time + rng.random(model.nu)))
-        motions.append(Motion(f"stand, swing all joints at 2 Hz with {amplitude:.2f} of the torque", standing(), still, swing))
+        motions.append(
+            Motion(
+                f"stand, swing all joints at 2 Hz with {amplitude:.2f} of the torque",
+                standing(),
+                still,
+                swing,
+            )
+        )
     for jump in JUMPS:
         actions = np.zeros((6 * len(jump["torques"]), model.nu))
         for step, torques in enumerate(jump["torques"]):
             for (joint, mirror), percent in zip(JUMP_JOINTS, torques, strict=True):
                 for side, sign in (("right_", 1), ("left_", mirror)) if mirror else (("", 1),):
-                    actions[6 * step : 6 * step + 6, motors[f"{side}{joint}"]] = sign * percent / 100
+                    actions[6 * step : 6 * step + 6, motors[f"{side}{joint}"]] = (
+                        sign * percent / 100
+                    )
         run_up = still.copy()
         run_up[0] = jump["speed"]
         what = f"jump with a run-up of {jump['speed']} m/s" if jump["speed"] else "jump"
         what += f" from knees bent by {jump['knees']:.0f}° and torso by {jump['torso']:.0f}°"
-        motions.append(Motion(what, standing(np.deg2rad(jump["knees"]), np.deg2rad(jump["torso"])), run_up, actions))
+        motions.append(
+            Motion(
+                what,
+                standing(np.deg2rad(jump["knees"]), np.deg2rad(jump["torso"])),
+                run_up,
+                actions,
+            )
+        )
     return motions
 
 
@@ -195,12 +221,18 @@ def throwing_motions() -> list[Motion]:
     for amplitude in np.geomspace(0.05, 2, 10):
         swing = np.zeros((throwing.EPISODE_STEPS, 24))
         swing[:, :-1] = amplitude * np.sin(2 * np.pi * (2 * time + rng.random(23)))
-        motions.append(Motion(f"swing all joints at 2 Hz by {amplitude / 2:.2f} rad", None, None, swing))
+        motions.append(
+            Motion(f"swing all joints at 2 Hz by {amplitude / 2:.2f} rad", None, None, swing)
+        )
     for seconds in np.arange(0, 1.2, 0.1):
         what = f"hold the first pose, open the hand after {seconds:.1f} s"
         motions.append(Motion(what, None, None, plan(seconds)))
         for lean in (-2, 2):
-            both = {f"{side}_{joint}": lean for side in ("left", "right") for joint in ("ankle_pitch", "hip_pitch")}
+            both = {
+                f"{side}_{joint}": lean
+                for side in ("left", "right")
+                for joint in ("ankle_pitch", "hip_pitch")
+            }
             what = f"fall {'forward' if lean > 0 else 'back'}, open the hand after {seconds:.1f} s"
             motions.append(Motion(what, None, None, plan(seconds, **both)))
     for pitch in range(-5, 6, 2):
@@ -209,8 +241,13 @@ def throwing_motions() -> list[Motion]:
                 arms = {"left_shoulder_pitch": pitch, "right_shoulder_pitch": pitch}
                 arms |= {"left_elbow_pitch": elbow, "right_elbow_pitch": elbow}
                 arms |= {"left_shoulder_roll": spread, "right_shoulder_roll": -spread}
-                what = f"arms to shoulder pitch {pitch / 2:+.1f}, roll {spread / 2:+.1f}, elbow {elbow / 2:+.1f} rad, "
-                motions.append(Motion(what + "open the hand after 0.3 s", None, None, plan(0.3, **arms)))
+                what = (
+                    f"arms to shoulder pitch {pitch / 2:+.1f}, roll {spread / 2:+.1f}, elbow "
+                    f"{elbow / 2:+.1f} rad, "
+                )
+                motions.append(
+                    Motion(what + "open the hand after 0.3 s", None, None, plan(0.3, **arms))
+                )
     return motions
 
 
@@ -225,9 +262,19 @@ def table(task: str) -> list[tuple[str, str, float, str]]:
     """
     make: type[Task]
     if task == "HumanoidMO":
-        make, ranges, motions, n_steps = humanoid.HumanoidMO, humanoid.RANGES, humanoid_motions(), 90
+        make, ranges, motions, n_steps = (
+            humanoid.HumanoidMO,
+            humanoid.RANGES,
+            humanoid_motions(),
+            90,
+        )
     else:
-        make, ranges, motions, n_steps = throwing.ThrowingMO, throwing.RANGES, throwing_motions(), throwing.EPISODE_STEPS
+        make, ranges, motions, n_steps = (
+            throwing.ThrowingMO,
+            throwing.RANGES,
+            throwing_motions(),
+            throwing.EPISODE_STEPS,
+        )
     found = []
     for index in range(5):
         built: Task = make(**dict.fromkeys(ranges, index))
@@ -236,7 +283,14 @@ def table(task: str) -> list[tuple[str, str, float, str]]:
             column = paid[:, built.reward_spec.names.index(f"{name}_range")]
             best = int(np.argmax(column))
             low, high = bounds[index]
-            found.append((name, f"{low:g} to {high:g} {UNITS[name]}", float(column[best]), motions[best].what))
+            found.append(
+                (
+                    name,
+                    f"{low:g} to {high:g} {UNITS[name]}",
+                    float(column[best]),
+                    motions[best].what,
+                )
+            )
     return sorted(found, key=lambda row: list(ranges).index(row[0]))
 
 

@@ -1,6 +1,8 @@
-"""Evaluate trained models of rl-zoo3's log folders, and draw their learning curves and a strip of frames.
+"""Evaluate trained models of rl-zoo3's log folders, and draw their learning curves and a strip of
+frames.
 
-``python examples/show.py logs/gcrppo/sb3_gcr-HumanoidRun-v0_1 logs/gcrppo/sb3_gcr-HumanoidRun-v0_2 --out humanoid``
+``python examples/show.py logs/gcrppo/sb3_gcr-HumanoidRun-v0_1 logs/gcrppo/sb3_gcr-HumanoidRun-v0_2
+--out humanoid``
 """
 
 from __future__ import annotations
@@ -25,10 +27,14 @@ from sb3_gcr.envs import BatchedVecEnv
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-#: What the curves show, by task: label, column of Monitor's file, and what one unit of it is per step.
+#: What the curves show, by task: label, column of Monitor's file, and what one unit of it is per
+#: step.
 CURVES = {
     "HumanoidRun": [("episode length [steps]", "l", 0.0), ("speed [m/s]", "r_progress", 0.5)],
-    "ThrowingMO": [("throwing, of 4.1", "r_throwing", 0.0), ("stability, of 0.5", "r_stability", 0.0)],
+    "ThrowingMO": [
+        ("throwing, of 4.1", "r_throwing", 0.0),
+        ("stability, of 0.5", "r_stability", 0.0),
+    ],
 }
 #: Episodes over which the curves are averaged.
 WINDOW = 500
@@ -42,24 +48,31 @@ class Run:
 
     def __init__(self, folder: Path):
         if not folder.is_dir():
-            raise FileNotFoundError(f"Parameter `folders` must be log folders of rl-zoo3, found none at {folder}.")
+            raise FileNotFoundError(
+                f"Parameter `folders` must be log folders of rl-zoo3, found none at {folder}."
+            )
         self.folder = folder
         self.name = folder.name.rsplit("_", 1)[0]
         self.env_id = self.name.replace("sb3_gcr-", "sb3_gcr/", 1)
         self.task = self.env_id.removeprefix("sb3_gcr/").removesuffix("-v0")
-        arguments = yaml.unsafe_load((folder / self.name / "args.yml").read_text())  # written on this machine
+        arguments = yaml.unsafe_load(
+            (folder / self.name / "args.yml").read_text()
+        )  # written on this machine
         self.seed = int(dict(arguments)["seed"])
 
     def curve(self, column: str, per_step: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """Steps and a running mean.
 
         :param column: of Monitor's file
-        :param per_step: if not 0, the column is divided by the episode's length and multiplied by this
+        :param per_step: if not 0, the column is divided by the episode's length and multiplied by
+            this
         """
         episodes: pd.DataFrame = load_results(str(self.folder))
         values = episodes[column]
         if per_step:
-            values = per_step * values.rolling(WINDOW, 1).sum() / episodes["l"].rolling(WINDOW, 1).sum()
+            values = (
+                per_step * values.rolling(WINDOW, 1).sum() / episodes["l"].rolling(WINDOW, 1).sum()
+            )
         else:
             values = values.rolling(WINDOW, 1).mean()
         return episodes["l"].cumsum().to_numpy(), values.to_numpy()
@@ -72,7 +85,9 @@ class Run:
         env = make_vec_env(self.env_id, n_envs, seed=1000 + self.seed, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
         normalized = VecNormalize.load(str(self.folder / self.name / "vecnormalize.pkl"), env)
         normalized.training = normalized.norm_reward = False
-        return GCRPPO.load(self.folder / f"{self.name}.zip", env=normalized, device="cpu"), normalized
+        return GCRPPO.load(
+            self.folder / f"{self.name}.zip", env=normalized, device="cpu"
+        ), normalized
 
     def evaluate(self, n_episodes: int) -> str:
         """One line of a table: length, speed where there is one, and the return of each term.
@@ -80,7 +95,9 @@ class Run:
         :param n_episodes: deterministic episodes
         """
         model, env = self.load(n_episodes)
-        _, lengths, returns = evaluate_components(model, env, n_episodes, return_episode_rewards=True)  # type: ignore[misc]
+        _, lengths, returns = evaluate_components(
+            model, env, n_episodes, return_episode_rewards=True
+        )  # type: ignore[misc]
         cells = [f"seed {self.seed}", f"{np.mean(lengths):.0f} steps"]
         if "progress" in returns:
             cells.append(f"{np.sum(returns['progress']) / 2 / np.sum(lengths):.2f} m/s")
@@ -102,7 +119,9 @@ class Run:
             if step >= first and (step - first) % every == 0:
                 picture = env.render()
                 assert picture is not None
-                shown.append(picture[100:460, 140:-140])  # the sky and the floor around the robot say nothing
+                shown.append(
+                    picture[100:460, 140:-140]
+                )  # the sky and the floor around the robot say nothing
             observation, *_ = env.step(model.predict(observation, deterministic=True)[0])
         env.close()
         return np.concatenate(shown, axis=1)
@@ -115,7 +134,9 @@ def draw_curves(runs: list[Run], path: Path) -> None:
     :param path: picture to write
     """
     curves = CURVES[runs[0].task]
-    figure, panels = plt.subplots(1, len(curves), figsize=(4.5 * len(curves), 3), layout="constrained")
+    figure, panels = plt.subplots(
+        1, len(curves), figsize=(4.5 * len(curves), 3), layout="constrained"
+    )
     for panel, (label, column, per_step) in zip(panels, curves, strict=True):
         for run in runs:
             steps, values = run.curve(column, per_step)
@@ -128,12 +149,26 @@ def draw_curves(runs: list[Run], path: Path) -> None:
 
 def main() -> None:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folders", type=Path, nargs="+", help="log folders of one env")
     parser.add_argument("--out", type=Path, required=True, help="start of the pictures' names")
-    parser.add_argument("--episodes", type=int, default=64, help="of the evaluation (default: %(default)s)")
-    parser.add_argument("--every", type=int, default=12, help="control steps between two frames (default: %(default)s)")
-    parser.add_argument("--first", type=int, default=300, help="control step of the first frame (default: %(default)s)")
+    parser.add_argument(
+        "--episodes", type=int, default=64, help="of the evaluation (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--every",
+        type=int,
+        default=12,
+        help="control steps between two frames (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--first",
+        type=int,
+        default=300,
+        help="control step of the first frame (default: %(default)s)",
+    )
     arguments = parser.parse_args()
     try:
         runs = [Run(folder) for folder in arguments.folders]
@@ -142,7 +177,9 @@ def main() -> None:
     for run in runs:
         print(run.evaluate(arguments.episodes), flush=True)
     draw_curves(runs, Path(f"{arguments.out}_curves.png"))
-    imageio.imwrite(f"{arguments.out}_frames.png", runs[0].frames(6, arguments.every, arguments.first))
+    imageio.imwrite(
+        f"{arguments.out}_frames.png", runs[0].frames(6, arguments.every, arguments.first)
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Train GCRPPO on a MuJoCo env whose reward has several terms, and look at what each term got: ``make train``."""
+"""Train GCRPPO on a MuJoCo env whose reward has several terms, and look at what each term got:
+``make train``.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gcr import GCRPPO, RESOLVERS, RewardDecomposition
-from sb3_gcr.report import write_report
+from sb3_gcr.logs.report import write_report
 
 
 def train(env_id: str, timesteps: int, seed: int, resolver: str, folder: Path) -> None:
@@ -38,12 +40,17 @@ def main() -> None:
     parser.add_argument("--timesteps", type=int, default=250_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--resolver", default="gcr", choices=sorted(RESOLVERS))
-    parser.add_argument("--folder", type=Path, default=Path("logs"), help="a folder for this run is made in it")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("logs"), help="a folder for this run is made in it"
+    )
     arguments = parser.parse_args()
     name = f"{arguments.env}-{arguments.resolver}-seed{arguments.seed}"
     runs = [0, *(int(path.name.rsplit("_", 1)[1]) for path in arguments.folder.glob(f"{name}_*"))]
     folder = arguments.folder / f"{name}_{max(runs) + 1}"
-    print(f"GCRPPO ({arguments.resolver}) on {arguments.env}, {arguments.timesteps:,} steps, seed {arguments.seed}")
+    print(
+        f"GCRPPO ({arguments.resolver}) on {arguments.env}, {arguments.timesteps:,} steps, seed "
+        f"{arguments.seed}"
+    )
     try:
         train(arguments.env, arguments.timesteps, arguments.seed, arguments.resolver, folder)
     except (ValueError, gym.error.Error) as error:

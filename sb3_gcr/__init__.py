@@ -1,18 +1,20 @@
 """GCR-PPO for Stable-Baselines3: PPO that keeps the terms of a reward apart.
 
-Read the method top to bottom: ``components`` (names and levels of the reward's terms), ``advantages`` (one advantage per
-term), ``gradients`` (one gradient per term and their Gramian), ``resolvers`` (who yields to whom), ``gcrppo`` (the loop).
-``envs`` has tasks with such rewards, and a thread pool that steps hundreds of them.
+Read the method top to bottom: ``components`` (names and levels of the reward's terms),
+``advantages`` (one advantage per term), ``gradients`` (one gradient per term and their Gramian),
+``resolvers`` (who yields to whom), ``gcrppo`` (the loop). ``envs`` has tasks with such rewards, and
+a thread pool that steps hundreds of them.
 """
 
 import sb3_gcr.envs as envs
 from sb3_gcr.buffers import VectorRolloutBuffer
-from sb3_gcr.checkpoints import latest_checkpoint
-from sb3_gcr.components import RewardDecomposition, RewardSpec
 from sb3_gcr.evaluation import evaluate_components
 from sb3_gcr.gcrppo import GCRPPO
 from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gcr.resolvers import RESOLVERS
+from sb3_gcr.rewards.decomposition import RewardDecomposition
+from sb3_gcr.rewards.spec import RewardSpec
+from sb3_gcr.saving.checkpoints import latest_checkpoint
 
 __version__ = "0.1.0"
 

@@ -17,9 +17,11 @@ ArrayT = TypeVar("ArrayT", bound=Any)
 def bootstrap_truncations(
     rewards: FloatArray, truncated: NDArray[np.bool_], terminal_values: FloatArray, gamma: float
 ) -> FloatArray:
-    """Add the value of the state that a time limit cut off: r^(k) + γ V^(k)(s_terminal) where truncated.
+    """Add the value of the state that a time limit cut off: r^(k) + γ V^(k)(s_terminal) where
+    truncated.
 
-    A time limit is not a termination: the episode would have gone on, and the critic says for how much.
+    A time limit is not a termination: the episode would have gone on, and the critic says for how
+    much.
 
     :param rewards: components of one step, shape (N, K)
     :param truncated: which of the N envs ended by a time limit, n of them, shape (N,)
@@ -41,7 +43,8 @@ def component_gae(
     gamma: float,
     gae_lambda: float,
 ) -> FloatArray:
-    r"""Generalised advantage estimation, once per component (METHOD: component GAE; arXiv:1506.02438).
+    r"""Generalised advantage estimation, once per component (METHOD: component GAE;
+    arXiv:1506.02438).
 
     .. math::
         δ_t^{(k)} = r_t^{(k)} + γ (1 - d_t) V^{(k)}(s_{t+1}) - V^{(k)}(s_t), \qquad
@@ -69,11 +72,13 @@ def component_gae(
 
 
 def joint_scale(advantages: ArrayT, eps: float = 1e-8, kappa_max: float = np.inf) -> Any:
-    r"""One scale for all components: the summed advantage gets unit variance, ratios between components are kept.
+    r"""One scale for all components: the summed advantage gets unit variance, ratios between
+    components are kept.
 
     .. math:: κ = 1 / \max(σ(\textstyle\sum_k A^{(k)}) + ε,\ \max_k σ(A^{(k)}) / κ_{max})
 
-    The second term bounds κ where components cancel and the variance of their sum vanishes. σ has ddof 1, as in PPO.
+    The second term bounds κ where components cancel and the variance of their sum vanishes. σ has
+    ddof 1, as in PPO.
 
     :param advantages: NumPy array or torch tensor of shape (samples, K)
     :param eps: added to the standard deviation
@@ -91,9 +96,11 @@ def joint_scale(advantages: ArrayT, eps: float = 1e-8, kappa_max: float = np.inf
 
 
 def normalize_jointly(advantages: ArrayT, eps: float = 1e-8, kappa_max: float = np.inf) -> ArrayT:
-    """Joint normalisation Â = κ (A - mean), with the κ of :func:`joint_scale` (METHOD: joint normalisation).
+    """Joint normalisation Â = κ (A - mean), with the κ of :func:`joint_scale` (METHOD: joint
+    normalisation).
 
-    :param advantages: NumPy array or torch tensor of shape (..., K); the mean is taken per component over all samples
+    :param advantages: NumPy array or torch tensor of shape (..., K); the mean is taken per
+        component over all samples
     :param eps: see :func:`joint_scale`
     :param kappa_max: see :func:`joint_scale`
     :return: same type and shape; a single sample is returned as it is, as in PPO
@@ -105,5 +112,7 @@ def normalize_jointly(advantages: ArrayT, eps: float = 1e-8, kappa_max: float = 
 
 
 def _std(samples: Any, n_samples: int) -> Any:
-    """Standard deviation over the first axis with ddof 1, spelled so that NumPy arrays and torch tensors both take it."""
+    """Standard deviation over the first axis with ddof 1, spelled so that NumPy arrays and torch
+    tensors both take it.
+    """
     return (((samples - samples.mean(0)) ** 2).sum(0) / (n_samples - 1)) ** 0.5

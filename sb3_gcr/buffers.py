@@ -1,4 +1,6 @@
-"""Rollout storage for K reward components: what SB3's rollout buffers do, with a last axis of size K."""
+"""Rollout storage for K reward components: what SB3's rollout buffers do, with a last axis of size
+K.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from sb3_gcr.advantages import component_gae
 
 
 class VectorRolloutBuffer(RolloutBuffer):
-    """Rollout buffer whose ``rewards``, ``values``, ``advantages`` and ``returns`` have shape (T, N, K).
+    """Rollout buffer whose ``rewards``, ``values``, ``advantages`` and ``returns`` have shape (T,
+    N, K).
 
     :param args: the arguments of SB3's ``RolloutBuffer``
     :param n_objectives: number K of reward components
@@ -36,7 +39,11 @@ class VectorRolloutBuffer(RolloutBuffer):
         self._tensors: dict[str, Any] = {}
         self._shuffled: dict[str, Any] = {}
         for name in ("rewards", "values", "advantages", "returns"):
-            setattr(self, name, np.zeros((self.buffer_size, self.n_envs, self.n_objectives), dtype=np.float32))
+            setattr(
+                self,
+                name,
+                np.zeros((self.buffer_size, self.n_envs, self.n_objectives), dtype=np.float32),
+            )
 
     def add(  # type: ignore[override]
         self,
@@ -56,26 +63,35 @@ class VectorRolloutBuffer(RolloutBuffer):
         :param value: V(s_t), shape (N, K)
         :param log_prob: log π(a_t|s_t), shape (N,)
         """
-        # SB3 flattens values, and a single number broadcasts; the values themselves are stored below.
+        # SB3 flattens values, and a single number broadcasts; the values themselves are stored
+        # below.
         super().add(obs, action, reward, episode_start, value[:1, :1], log_prob)
         self.values[self.pos - 1] = value.cpu().numpy()
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: NDArray[Any]) -> None:
-        """Fill ``advantages`` by :func:`~sb3_gcr.advantages.component_gae` and ``returns`` = advantages + values.
+        """Fill ``advantages`` by :func:`~sb3_gcr.advantages.component_gae` and ``returns`` =
+        advantages + values.
 
         :param last_values: V(s_T), shape (N, K)
         :param dones: whether the last step ended an episode, shape (N,)
         """
         self.advantages = component_gae(
-            self.rewards, self.values, self.episode_starts, last_values.cpu().numpy(), dones, self.gamma, self.gae_lambda
+            self.rewards,
+            self.values,
+            self.episode_starts,
+            last_values.cpu().numpy(),
+            dones,
+            self.gamma,
+            self.gae_lambda,
         )
         self.returns = self.advantages + self.values
 
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
-        """Yield the rollout in random minibatches; ``old_values``, ``advantages`` and ``returns`` have shape (B, K).
+        """Yield the rollout in random minibatches; ``old_values``, ``advantages`` and ``returns``
+        have shape (B, K).
 
-        The arrays become tensors on the device once per rollout; changes made to them after the first call are not seen. The
-        minibatches of one call share memory with those of the next.
+        The arrays become tensors on the device once per rollout; changes made to them after the
+        first call are not seen. The minibatches of one call share memory with those of the next.
 
         :param batch_size: size B of a minibatch; None is the whole rollout
         """
@@ -92,7 +108,9 @@ class VectorRolloutBuffer(RolloutBuffer):
         # NumPy's global generator and one permutation a pass, as in SB3: the minibatches are PPO's.
         indices = th.from_numpy(np.random.permutation(n_samples)).to(self.device)
         if not self._shuffled:
-            self._shuffled = {name: _each(tensor, th.empty_like) for name, tensor in self._tensors.items()}
+            self._shuffled = {
+                name: _each(tensor, th.empty_like) for name, tensor in self._tensors.items()
+            }
         for name, tensor in self._tensors.items():
             _each(tensor, partial(_gather, indices), self._shuffled[name])
         batch_size = batch_size or n_samples
@@ -101,7 +119,9 @@ class VectorRolloutBuffer(RolloutBuffer):
             for name, tensor in self._shuffled.items()
         }
         for index in range(-(-n_samples // batch_size)):
-            yield self._samples_class(**{name: _each(tensors, itemgetter(index)) for name, tensors in parts.items()})
+            yield self._samples_class(
+                **{name: _each(tensors, itemgetter(index)) for name, tensors in parts.items()}
+            )
 
     def _to_samples(self, array: Any) -> Any:
         return self.to_torch(self.swap_and_flatten(array), copy=False)
@@ -121,5 +141,7 @@ def _gather(indices: th.Tensor, source: th.Tensor, target: th.Tensor) -> None:
 def _each(value: Any, function: Callable[..., Any], *others: Any) -> Any:
     """Apply a function to an array, or to every array of a dictionary."""
     if isinstance(value, dict):
-        return {key: function(part, *(other[key] for other in others)) for key, part in value.items()}
+        return {
+            key: function(part, *(other[key] for other in others)) for key, part in value.items()
+        }
     return function(value, *others)

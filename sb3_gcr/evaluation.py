@@ -10,7 +10,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_gcr.components import COMPONENTS_KEY, ERROR_KEY, find_reward_spec
+from sb3_gcr.rewards.reading import find_reward_spec
+from sb3_gcr.rewards.spec import COMPONENTS_KEY, ERROR_KEY
 
 
 class ComponentEvaluation(NamedTuple):
@@ -33,7 +34,8 @@ def evaluate_components(
     return_episode_rewards: bool = False,
     warn: bool = True,
 ) -> ComponentEvaluation | tuple[list[float], list[int], dict[str, list[float]]]:
-    """SB3's ``evaluate_policy``, with the undiscounted return of every component in the units of the env.
+    """SB3's ``evaluate_policy``, with the undiscounted return of every component in the units of
+    the env.
 
     :param model: anything with ``predict``
     :param env: an env or VecEnv that reports reward components
@@ -44,13 +46,17 @@ def evaluate_components(
     :param reward_threshold: raise if the mean return is below it, as in SB3
     :param return_episode_rewards: return lists per episode instead of means
     :param warn: warn about a missing ``Monitor``
-    :return: means and standard deviations; or returns and lengths per episode, and the returns of each component by name
+    :return: means and standard deviations; or returns and lengths per episode, and the returns of
+        each component by name
     :raises ValueError: if the env reports no components
     """
     venv = env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
     spec = find_reward_spec(venv)
     if spec is None:
-        raise ValueError("Parameter `env` must report reward components, found none. Wrap it with `RewardDecomposition`.")
+        raise ValueError(
+            "Parameter `env` must report reward components, found none. Wrap it with "
+            "`RewardDecomposition`."
+        )
     running = np.zeros((venv.num_envs, len(spec)))
     episodes: list[np.ndarray[Any, Any]] = []
 
@@ -59,10 +65,16 @@ def evaluate_components(
         batched = getattr(venv, COMPONENTS_KEY, None)
         row = batched[index] if batched is not None else info.get(COMPONENTS_KEY)
         if row is None:
-            raise ValueError(f"Env index {index}: {info.get(ERROR_KEY, 'found no `reward_components` in its info.')}")
+            raise ValueError(
+                f"Env index {index}: "
+                f"{info.get(ERROR_KEY, 'found no `reward_components` in its info.')}"
+            )
         running[index] += row
-        # An episode ends where evaluate_policy counts it: a wrapper may report the loss of a life as done.
-        if local_variables["done"] and (not local_variables["is_monitor_wrapped"] or "episode" in info):
+        # An episode ends where evaluate_policy counts it: a wrapper may report the loss of a life
+        # as done.
+        if local_variables["done"] and (
+            not local_variables["is_monitor_wrapped"] or "episode" in info
+        ):
             episodes.append(running[index].copy())
             running[index] = 0.0
         if callback is not None:
@@ -81,7 +93,11 @@ def evaluate_components(
     )
     components = np.array(episodes)
     if return_episode_rewards:
-        return rewards, lengths, {name: components[:, index].tolist() for index, name in enumerate(spec.names)}  # type: ignore[return-value]
+        return (
+            rewards,
+            lengths,
+            {name: components[:, index].tolist() for index, name in enumerate(spec.names)},
+        )  # type: ignore[return-value]
     return ComponentEvaluation(
         float(np.mean(rewards)),
         float(np.std(rewards)),

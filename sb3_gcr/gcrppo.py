@@ -1,4 +1,6 @@
-"""GCRPPO: PPO that keeps the components of a reward apart and resolves the conflicts between their gradients."""
+"""GCRPPO: PPO that keeps the components of a reward apart and resolves the conflicts between their
+gradients.
+"""
 
 from __future__ import annotations
 
@@ -17,22 +19,22 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import explained_variance, update_learning_rate
 
 from sb3_gcr.advantages import joint_scale, normalize_jointly
-from sb3_gcr.components import GYMNASIUM_ENVS, RewardDecomposition
-from sb3_gcr.diagnostics import (
+from sb3_gcr.gradients.by_autograd import ManyBackwards
+from sb3_gcr.gradients.by_hand import OneBackward
+from sb3_gcr.logs.figures import (
     EpochStatistics,
     Minibatch,
     Samples,
-    append_cosines,
-    cosine_figure,
     join,
     mean_cosines,
     measure_epoch,
     summarise,
 )
-from sb3_gcr.gradients import ManyBackwards, kl_estimates, surrogate_cotangents, value_cotangents
-from sb3_gcr.one_backward import OneBackward
-from sb3_gcr.persistent_ppo import PersistentPPO
+from sb3_gcr.logs.shown import append_cosines, cosine_figure
+from sb3_gcr.losses import kl_estimates, surrogate_cotangents, value_cotangents
 from sb3_gcr.resolvers import Resolver, bind_resolver
+from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS, RewardDecomposition
+from sb3_gcr.saving.model import PersistentPPO
 from sb3_gcr.schedules import adapt_learning_rate
 
 SelfGCRPPO = TypeVar("SelfGCRPPO", bound="GCRPPO")
@@ -42,23 +44,29 @@ FIGURE_INTERVAL = 10
 
 
 class GCRPPO(PersistentPPO):
-    """PPO with gradient conflict resolution (GCR-PPO, arXiv:2509.14816): a critic head, advantage and gradient per component.
+    """PPO with gradient conflict resolution (GCR-PPO, arXiv:2509.14816): a critic head, advantage
+    and gradient per component.
 
-    The env must report its reward components (see :class:`~sb3_gcr.components.RewardDecomposition`); an id of Gymnasium's
-    MuJoCo envs such as ``"Humanoid-v5"`` is taken apart by itself. Without components it is SB3's PPO. All parameters of
+    The env must report its reward components (see
+    :class:`~sb3_gcr.components.RewardDecomposition`); an id of Gymnasium's MuJoCo envs such as
+        ``"Humanoid-v5"`` is taken apart by itself. Without components it is SB3's PPO. All
+        parameters of
     SB3's PPO keep their names, order and defaults; these are added:
 
-    :param resolver: name in ``RESOLVERS``, or a callable ``(gramian (K, K), levels (K,), rng) -> weights (K,)``
+    :param resolver: name in ``RESOLVERS``, or a callable ``(gramian (K, K), levels (K,), rng) ->
+        weights (K,)``
     :param resolver_kwargs: keyword arguments bound to the resolver
-    :param advantage_scope: over what advantages are normalised jointly, "rollout" or "minibatch"; None is "rollout" for more
-        than one component and "minibatch", as in PPO, for one
+    :param advantage_scope: over what advantages are normalised jointly, "rollout" or "minibatch";
+        None is "rollout" for more than one component and "minibatch", as in PPO, for one
     :param kappa_max: bound of κ · max_k std(A^(k)), for components that cancel each other
-    :param desired_kl: target of the learning rate that follows the KL divergence; None keeps ``learning_rate``
-    :param gramian_method: "one_backward" for actors of linear layers, "passes" (K backward passes) for any network; "auto"
-        takes the first where it fits. Both give the same numbers
-    :param gramian_samples: number of samples of each minibatch that the weights are taken from, for large networks and
-        batches; the step takes all of them. None is exact
-    :raises ValueError: for an unknown resolver or scope, a wrong policy class, a spec that does not match a loaded model
+    :param desired_kl: target of the learning rate that follows the KL divergence; None keeps
+        ``learning_rate``
+    :param gramian_method: "one_backward" for actors of linear layers, "passes" (K backward passes)
+        for any network; "auto" takes the first where it fits. Both give the same numbers
+    :param gramian_samples: number of samples of each minibatch that the weights are taken from, for
+        large networks and batches; the step takes all of them. None is exact
+    :raises ValueError: for an unknown resolver or scope, a wrong policy class, a spec that does not
+        match a loaded model
     """
 
     def __init__(
@@ -148,23 +156,36 @@ class GCRPPO(PersistentPPO):
     def _check_parameters(self) -> None:
         if self.advantage_scope not in (None, "rollout", "minibatch"):
             raise ValueError(
-                f"Parameter `advantage_scope` must be 'rollout', 'minibatch' or None, found {self.advantage_scope!r}."
+                "Parameter `advantage_scope` must be 'rollout', 'minibatch' or None, found "
+                f"{self.advantage_scope!r}."
             )
         if not self.kappa_max > 0:
-            raise ValueError(f"Parameter `kappa_max` must be a number > 0, found {self.kappa_max!r}.")
+            raise ValueError(
+                f"Parameter `kappa_max` must be a number > 0, found {self.kappa_max!r}."
+            )
         if self.gramian_method not in ("auto", "one_backward", "passes"):
             raise ValueError(
-                f"Parameter `gramian_method` must be 'auto', 'one_backward' or 'passes', found {self.gramian_method!r}."
+                "Parameter `gramian_method` must be 'auto', 'one_backward' or 'passes', found "
+                f"{self.gramian_method!r}."
             )
         samples = self.gramian_samples
         if samples is not None and not (isinstance(samples, int | np.integer) and samples > 0):
-            raise ValueError(f"Parameter `gramian_samples` must be an integer > 0 or None, found {self.gramian_samples!r}.")
+            raise ValueError(
+                "Parameter `gramian_samples` must be an integer > 0 or None, found "
+                f"{self.gramian_samples!r}."
+            )
         if self.desired_kl is not None and not self.desired_kl > 0:
-            raise ValueError(f"Parameter `desired_kl` must be a number > 0 or None, found {self.desired_kl!r}.")
+            raise ValueError(
+                f"Parameter `desired_kl` must be a number > 0 or None, found {self.desired_kl!r}."
+            )
 
     @property
     def _is_plain_ppo(self) -> bool:
-        return super()._is_plain_ppo and self.desired_kl is None and self.advantage_scope in (None, "minibatch")
+        return (
+            super()._is_plain_ppo
+            and self.desired_kl is None
+            and self.advantage_scope in (None, "minibatch")
+        )
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed all generators of SB3, and the one that the resolver draws from.
@@ -185,12 +206,16 @@ class GCRPPO(PersistentPPO):
         if not self._is_plain_ppo:
             networks = self._choose_networks()
             way = "one backward pass" if isinstance(networks, OneBackward) else "K backward passes"
-            library = "NumPy" if isinstance(networks, OneBackward) and networks.in_numpy else "PyTorch"
+            library = (
+                "NumPy" if isinstance(networks, OneBackward) and networks.in_numpy else "PyTorch"
+            )
             self.logger.info(f"Gradients of the components: {way} in {library}")
         return result
 
     @th.no_grad()
-    @np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused with an error of its own
+    @np.errstate(
+        over="ignore", invalid="ignore"
+    )  # what is not finite is refused with an error of its own
     def train(self) -> None:
         """Update the policy from the current rollout: the paper's method, minibatch by minibatch.
 
@@ -216,7 +241,9 @@ class GCRPPO(PersistentPPO):
                 minibatches: list[Minibatch] = []
                 for batch in self.rollout_buffer.get(self.batch_size):
                     is_first = not (epochs or minibatches)
-                    minibatch, continue_training = self._train_minibatch(batch, kappa, clip_range, clip_range_vf, is_first)
+                    minibatch, continue_training = self._train_minibatch(
+                        batch, kappa, clip_range, clip_range_vf, is_first
+                    )
                     minibatches.append(minibatch)
                     if not continue_training:
                         break
@@ -230,8 +257,10 @@ class GCRPPO(PersistentPPO):
         fits = OneBackward.fits(self.policy)
         if self.gramian_method == "one_backward" and not fits:
             raise ValueError(
-                "Parameter `gramian_method` must be 'auto' or 'passes' for this policy, found 'one_backward', which needs an "
-                "actor and a critic of linear layers and common activations, a flat features extractor and no gSDE."
+                "Parameter `gramian_method` must be 'auto' or 'passes' for this policy, found "
+                "'one_backward', which needs an "
+                "actor and a critic of linear layers and common activations, a flat features "
+                "extractor and no gSDE."
             )
         self.logger.record("gcr/one_backward", int(fits and self.gramian_method != "passes"))
         if self.gramian_method == "passes" or not fits:
@@ -239,12 +268,16 @@ class GCRPPO(PersistentPPO):
         return OneBackward(self.policy, self.batch_size)
 
     def _check_rollout_is_finite(self) -> None:
-        """Refuse a rollout with NaN or infinity, which rewards, observations or the networks may have brought in."""
+        """Refuse a rollout with NaN or infinity, which rewards, observations or the networks may
+        have brought in.
+        """
         for name in ("log_probs", "values", "advantages"):
             if not np.isfinite(getattr(self.rollout_buffer, name)).all():
                 raise ValueError(
-                    f"The rollout's `{name}` must be finite, found NaN or infinity before the update at timestep "
-                    f"{self.num_timesteps}. The policy is as it was; check rewards and observations, e.g. with VecCheckNan."
+                    f"The rollout's `{name}` must be finite, found NaN or infinity before the "
+                    "update at timestep "
+                    f"{self.num_timesteps}. The policy is as it was; check rewards and "
+                    "observations, e.g. with VecCheckNan."
                 )
 
     @property
@@ -254,7 +287,9 @@ class GCRPPO(PersistentPPO):
         return self.advantage_scope or ("rollout" if self.n_objectives > 1 else "minibatch")
 
     def _normalize_rollout(self) -> th.Tensor | None:
-        """Normalise the whole rollout's advantages, if that is the scope, and return κ; None if minibatches have theirs."""
+        """Normalise the whole rollout's advantages, if that is the scope, and return κ; None if
+        minibatches have theirs.
+        """
         if self._scope == "minibatch":
             return None
         kappa = 1.0
@@ -265,15 +300,30 @@ class GCRPPO(PersistentPPO):
         return th.tensor(kappa, dtype=th.float32, device=self.device)
 
     def _train_minibatch(
-        self, batch: Any, kappa: th.Tensor | None, clip_range: float, clip_range_vf: float | None, is_first: bool
+        self,
+        batch: Any,
+        kappa: th.Tensor | None,
+        clip_range: float,
+        clip_range_vf: float | None,
+        is_first: bool,
     ) -> tuple[Minibatch, bool]:
-        """One optimiser step; returns what is logged of it and whether ``target_kl`` lets training go on."""
-        actions = batch.actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else batch.actions
+        """One optimiser step; returns what is logged of it and whether ``target_kl`` lets training
+        go on.
+        """
+        actions = (
+            batch.actions.long().flatten()
+            if isinstance(self.action_space, spaces.Discrete)
+            else batch.actions
+        )
         networks = self._networks.evaluate(batch.observations, actions)
         tensors = batch.old_log_prob, batch.old_values, batch.returns, batch.advantages
-        old_log_prob, old_values, returns, advantages = (networks.array(tensor) for tensor in tensors)
+        old_log_prob, old_values, returns, advantages = (
+            networks.array(tensor) for tensor in tensors
+        )
         if kappa is None:
-            kappa = th.as_tensor(joint_scale(advantages, kappa_max=self.kappa_max), device=self.device)
+            kappa = th.as_tensor(
+                joint_scale(advantages, kappa_max=self.kappa_max), device=self.device
+            )
             advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
         cotangents = surrogate_cotangents(networks.log_prob, old_log_prob, advantages, clip_range)
         needed = [networks.gramian(cotangents, self.gramian_samples).reshape(-1)]
@@ -285,15 +335,25 @@ class GCRPPO(PersistentPPO):
         arrays = networks.log_prob, old_log_prob, advantages, networks.values, old_values, returns
         samples = Samples(*arrays, networks.entropy_loss(), kappa)
         if not np.isfinite(gramian).all():
-            raise ValueError(self._not_finite_message(Minibatch(samples, gramian, np.ones(n)), clip_range, clip_range_vf))
+            raise ValueError(
+                self._not_finite_message(
+                    Minibatch(samples, gramian, np.ones(n)), clip_range, clip_range_vf
+                )
+            )
         assert self._resolver_rng is not None
         minibatch = Minibatch(samples, gramian, self._weigh(gramian, self._resolver_rng))
         if self.target_kl is not None and host[-1] > 1.5 * self.target_kl:
             self.logger.info(f"Early stopping due to reaching max kl: {host[-1]:.2f}")
             return minibatch, False
-        if self.desired_kl is not None and not is_first:  # before the first step the KL divergence is 0 and says nothing
-            self._set_learning_rate(adapt_learning_rate(self._learning_rate, float(host[-1]), self.desired_kl))
-        weights = networks.array(th.from_numpy(minibatch.weights.astype(np.float32)).to(self.device))
+        if (
+            self.desired_kl is not None and not is_first
+        ):  # before the first step the KL divergence is 0 and says nothing
+            self._set_learning_rate(
+                adapt_learning_rate(self._learning_rate, float(host[-1]), self.desired_kl)
+            )
+        weights = networks.array(
+            th.from_numpy(minibatch.weights.astype(np.float32)).to(self.device)
+        )
         value_gradients = value_cotangents(networks.values, old_values, returns, clip_range_vf)
         value_gradients *= self.vf_coef
         networks.backward(cotangents @ weights, value_gradients, self.ent_coef)
@@ -305,17 +365,24 @@ class GCRPPO(PersistentPPO):
 
     def _weigh(self, gramian: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         """Call the resolver and check what it returns."""
-        weights = np.asarray(self._resolve(gramian, np.array(self.reward_spec.levels), rng), dtype=float)
+        weights = np.asarray(
+            self._resolve(gramian, np.array(self.reward_spec.levels), rng), dtype=float
+        )
         if weights.shape != (self.n_objectives,):
             raise ValueError(
-                f"Parameter `resolver` must return weights of shape ({self.n_objectives},), found shape {weights.shape}."
+                f"Parameter `resolver` must return weights of shape ({self.n_objectives},), found "
+                f"shape {weights.shape}."
             )
         if not np.isfinite(weights).all():
             raise ValueError(f"Parameter `resolver` must return finite weights, found {weights}.")
         return weights
 
     def _not_finite_message(
-        self, minibatch: Minibatch, clip_range: float, clip_range_vf: float | None, norm: float = np.inf
+        self,
+        minibatch: Minibatch,
+        clip_range: float,
+        clip_range_vf: float | None,
+        norm: float = np.inf,
     ) -> str:
         figures = measure_epoch([minibatch], clip_range, clip_range_vf)
         by_name = {
@@ -324,10 +391,14 @@ class GCRPPO(PersistentPPO):
             "value loss": figures.value_losses,
             "gradient norm": np.array(norm),
         }
-        name, found = next((name, found) for name, found in by_name.items() if not np.isfinite(found).all())
+        name, found = next(
+            (name, found) for name, found in by_name.items() if not np.isfinite(found).all()
+        )
         return (
-            f"The {name} must be finite, found {found[~np.isfinite(found)][0]} in the update at timestep "
-            f"{self.num_timesteps}. The weights are those of the last good step; a smaller `learning_rate`, or scaled "
+            f"The {name} must be finite, found {found[~np.isfinite(found)][0]} in the update at "
+            "timestep "
+            f"{self.num_timesteps}. The weights are those of the last good step; a smaller "
+            "`learning_rate`, or scaled "
             "returns (VecNormalize), may help."
         )
 
@@ -340,12 +411,16 @@ class GCRPPO(PersistentPPO):
         self._adaptive_learning_rate = learning_rate
         update_learning_rate(self.policy.optimizer, learning_rate)
 
-    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+    def _update_learning_rate(
+        self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer
+    ) -> None:
         super()._update_learning_rate(optimizers)
         if self.desired_kl is not None and self._adaptive_learning_rate is not None:
             self._set_learning_rate(self._adaptive_learning_rate)
 
-    def _log_update(self, epochs: list[EpochStatistics], clip_range: float, clip_range_vf: float | None) -> None:
+    def _log_update(
+        self, epochs: list[EpochStatistics], clip_range: float, clip_range_vf: float | None
+    ) -> None:
         """Record the means over all minibatches of the update under PPO's keys and ours."""
         scalars, by_component = summarise(epochs, self.reward_spec)
         values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
@@ -354,9 +429,16 @@ class GCRPPO(PersistentPPO):
                 values[..., index].flatten(), returns[..., index].flatten()
             )
         last = epochs[-1]
-        policy_loss, value_loss = last.weights[-1] @ last.policy_losses[-1], last.value_losses[-1].sum()
-        scalars["train/loss"] = policy_loss + self.ent_coef * last.entropy_losses[-1] + self.vf_coef * value_loss
-        scalars["train/explained_variance"] = explained_variance(values.sum(-1).flatten(), returns.sum(-1).flatten())
+        policy_loss, value_loss = (
+            last.weights[-1] @ last.policy_losses[-1],
+            last.value_losses[-1].sum(),
+        )
+        scalars["train/loss"] = (
+            policy_loss + self.ent_coef * last.entropy_losses[-1] + self.vf_coef * value_loss
+        )
+        scalars["train/explained_variance"] = explained_variance(
+            values.sum(-1).flatten(), returns.sum(-1).flatten()
+        )
         if hasattr(self.policy, "log_std"):
             scalars["train/std"] = th.exp(self.policy.log_std).mean().item()
         scalars["train/clip_range"] = clip_range
@@ -366,13 +448,20 @@ class GCRPPO(PersistentPPO):
             scalars["train/learning_rate"] = self._learning_rate
         for key, value in scalars.items():
             self.logger.record(key, value)
-        for key, value in by_component.items():  # SB3's table raises when two keys are cut to the same 36 characters
+        for (
+            key,
+            value,
+        ) in (
+            by_component.items()
+        ):  # SB3's table raises when two keys are cut to the same 36 characters
             self.logger.record(key, value, exclude="stdout")
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._log_cosines(mean_cosines(epochs))
 
     def _log_cosines(self, matrix: NDArray[np.float64]) -> None:
-        """Write the cosine matrix to its file, and every few updates to TensorBoard as a picture."""
+        """Write the cosine matrix to its file, and every few updates to TensorBoard as a
+        picture.
+        """
         folder = self.logger.get_dir()
         if self.n_objectives == 1 or folder is None:
             return
@@ -380,7 +469,10 @@ class GCRPPO(PersistentPPO):
         if self._n_rollouts_learned % FIGURE_INTERVAL == 1 and any(
             isinstance(f, TensorBoardOutputFormat) for f in self.logger.output_formats
         ):
-            figure = Figure(cosine_figure(self.reward_spec, {f"{self.num_timesteps} steps": matrix}), close=False)
+            figure = Figure(
+                cosine_figure(self.reward_spec, {f"{self.num_timesteps} steps": matrix}),
+                close=False,
+            )
             self.logger.record("gcr/cosines", figure, exclude=("stdout", "log", "json", "csv"))
 
     def learn(
@@ -402,4 +494,6 @@ class GCRPPO(PersistentPPO):
         :param progress_bar: show a progress bar (needs tqdm and rich)
         :return: the model
         """
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )

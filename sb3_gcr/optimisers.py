@@ -10,11 +10,12 @@ from torch.optim import optimizer
 
 
 class FusedAdam(th.optim.Adam):
-    """``torch.optim.Adam(fused=True)`` that collects its arguments once: the same numbers, state and state dict.
+    """``torch.optim.Adam(fused=True)`` that collects its arguments once: the same numbers, state
+    and state dict.
 
-    For small networks PyTorch's step spends most of its time looking up every parameter's state and recording itself for the
-    profiler. Whatever is unusual (closures, hooks, several parameter groups, AMSGrad, parameters without gradient, a changed
-    state) takes PyTorch's own step.
+    For small networks PyTorch's step spends most of its time looking up every parameter's state and
+    recording itself for the profiler. Whatever is unusual (closures, hooks, several parameter
+    groups, AMSGrad, parameters without gradient, a changed state) takes PyTorch's own step.
 
     :param params: as for ``torch.optim.Adam``
     :param kwargs: as for ``torch.optim.Adam``
@@ -43,10 +44,21 @@ class FusedAdam(th.optim.Adam):
     @th.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """One step of Adam."""
-        gradients = [p.grad for p in self._arguments[0] if p.grad is not None] if self._arguments is not None else []
-        if closure is not None or self._has_hooks() or self._arguments is None or len(gradients) < len(self._arguments[0]):
+        gradients = (
+            [p.grad for p in self._arguments[0] if p.grad is not None]
+            if self._arguments is not None
+            else []
+        )
+        if (
+            closure is not None
+            or self._has_hooks()
+            or self._arguments is None
+            or len(gradients) < len(self._arguments[0])
+        ):
             step = th.optim.Adam.step
-            loss = (step if hasattr(step, "hooked") else self.profile_hook_step(step))(self, closure)
+            loss = (step if hasattr(step, "hooked") else self.profile_hook_step(step))(
+                self, closure
+            )
             self._arguments = self._collect()
             return loss
         parameters, averages, squares, steps = self._arguments
@@ -69,7 +81,8 @@ class FusedAdam(th.optim.Adam):
         )
         return None
 
-    step.hooked = True  # type: ignore[attr-defined]  # else PyTorch wraps it in a record that costs as much as the kernel
+    # else PyTorch wraps it in a record that costs as much as the kernel
+    step.hooked = True  # type: ignore[attr-defined]
 
     def _has_hooks(self) -> bool:
         return bool(
@@ -82,12 +95,25 @@ class FusedAdam(th.optim.Adam):
     def _collect(self) -> tuple[list[th.Tensor], ...] | None:
         """The kernel's arguments, if every parameter has a state and nothing is unusual."""
         group = self.param_groups[0]
-        unusual = len(self.param_groups) > 1 or group["amsgrad"] or group["capturable"] or isinstance(group["lr"], th.Tensor)
+        unusual = (
+            len(self.param_groups) > 1
+            or group["amsgrad"]
+            or group["capturable"]
+            or isinstance(group["lr"], th.Tensor)
+        )
         parameters = group["params"]
-        states = [state for state in (self.state.get(parameter) for parameter in parameters) if state]
-        if unusual or len(states) < len(parameters) or len({parameter.device for parameter in parameters}) > 1:
+        states = [
+            state for state in (self.state.get(parameter) for parameter in parameters) if state
+        ]
+        if (
+            unusual
+            or len(states) < len(parameters)
+            or len({parameter.device for parameter in parameters}) > 1
+        ):
             return None
         self._steps = th.stack([state["step"] for state in states])
         for state, step in zip(states, self._steps.unbind(), strict=True):
             state["step"] = step
-        return parameters, *([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
+        return parameters, *(
+            [state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step")
+        )

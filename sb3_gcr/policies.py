@@ -5,7 +5,11 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy, MultiInputActorCriticPolicy
+from stable_baselines3.common.policies import (
+    ActorCriticCnnPolicy,
+    ActorCriticPolicy,
+    MultiInputActorCriticPolicy,
+)
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
@@ -13,19 +17,23 @@ from sb3_gcr.optimisers import FusedAdam
 
 
 class MultiHeadActorCriticPolicy(ActorCriticPolicy):
-    """SB3's ``ActorCriticPolicy`` with V_φ(s) ∈ R^K: ``predict_values``, ``forward`` and ``evaluate_actions`` return (B, K).
+    """SB3's ``ActorCriticPolicy`` with V_φ(s) ∈ R^K: ``predict_values``, ``forward`` and
+    ``evaluate_actions`` return (B, K).
 
     With ``n_objectives=1`` it is SB3's policy, weight for weight.
 
     :param args: the arguments of SB3's policy
-    :param n_objectives: number K of value heads; ``GCRPPO`` sets it, it does not belong in ``policy_kwargs``
+    :param n_objectives: number K of value heads; ``GCRPPO`` sets it, it does not belong in
+        ``policy_kwargs``
     :param kwargs: the keyword arguments of SB3's policy
     """
 
     def __init__(self, *args: Any, n_objectives: int = 1, **kwargs: Any):
         self.n_objectives = n_objectives
         self._fuse_optimizer = (
-            n_objectives > 1 and kwargs.get("optimizer_class") is None and kwargs.get("optimizer_kwargs") is None
+            n_objectives > 1
+            and kwargs.get("optimizer_class") is None
+            and kwargs.get("optimizer_kwargs") is None
         )
         super().__init__(*args, **kwargs)
 
@@ -36,14 +44,22 @@ class MultiHeadActorCriticPolicy(ActorCriticPolicy):
         self.value_net = nn.Linear(self.mlp_extractor.latent_dim_vf, self.n_objectives)
         if self.ortho_init:
             self.value_net.apply(partial(self.init_weights, gain=1))
-        # The fused Adam takes the same steps up to rounding; only where the user chose no optimiser of their own.
+        # The fused Adam takes the same steps up to rounding; only where the user chose no optimiser
+        # of their own.
         optimizer_class: Any = FusedAdam if self._fuse_optimizer else self.optimizer_class
-        self.optimizer = optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+        self.optimizer = optimizer_class(
+            self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs
+        )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        # SB3 leaves share_features_extractor out, and a saved policy would come back with another architecture.
-        return {**data, "n_objectives": self.n_objectives, "share_features_extractor": self.share_features_extractor}
+        # SB3 leaves share_features_extractor out, and a saved policy would come back with another
+        # architecture.
+        return {
+            **data,
+            "n_objectives": self.n_objectives,
+            "share_features_extractor": self.share_features_extractor,
+        }
 
 
 class MultiHeadActorCriticCnnPolicy(MultiHeadActorCriticPolicy, ActorCriticCnnPolicy):
@@ -51,7 +67,9 @@ class MultiHeadActorCriticCnnPolicy(MultiHeadActorCriticPolicy, ActorCriticCnnPo
 
 
 class MultiHeadMultiInputActorCriticPolicy(MultiHeadActorCriticPolicy, MultiInputActorCriticPolicy):
-    """:class:`MultiHeadActorCriticPolicy` for dictionary observations: SB3's ``MultiInputPolicy`` with K value heads."""
+    """:class:`MultiHeadActorCriticPolicy` for dictionary observations: SB3's ``MultiInputPolicy``
+    with K value heads.
+    """
 
 
 MlpPolicy = MultiHeadActorCriticPolicy

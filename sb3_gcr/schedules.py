@@ -8,7 +8,8 @@ FACTOR = 1.5
 
 
 def adapt_learning_rate(learning_rate: float, kl: float, desired_kl: float) -> float:
-    """Next learning rate: ÷ 1.5 where KL > 2 desired_kl, × 1.5 where KL < desired_kl / 2, within [1e-5, 1e-2].
+    """Next learning rate: ÷ 1.5 where KL > 2 desired_kl, × 1.5 where KL < desired_kl / 2, within
+    [1e-5, 1e-2].
 
     :param learning_rate: current rate
     :param kl: KL(old policy ‖ current policy) of the minibatch

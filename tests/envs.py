@@ -26,13 +26,17 @@ OBSERVATIONS = {
     "Image": spaces.Box(0, 255, (1, 36, 36), np.uint8),
     "ImageChannelsLast": spaces.Box(0, 255, (36, 36, 1), np.uint8),
     "Dict": spaces.Dict({"a": spaces.Box(-1, 1, (3,), np.float32), "b": spaces.Discrete(4)}),
-    "DictImage": spaces.Dict({"a": spaces.Box(-1, 1, (3,), np.float32), "i": spaces.Box(0, 255, (1, 36, 36), np.uint8)}),
+    "DictImage": spaces.Dict(
+        {"a": spaces.Box(-1, 1, (3,), np.float32), "i": spaces.Box(0, 255, (1, 36, 36), np.uint8)}
+    ),
 }
 SPEC = RewardSpec(("go", "stay", "save"), (0, 0, 1))
 
 
 class Env(gym.Env[Any, Any]):
-    """Random observations; components depend on observation and action; ends at random and by a time limit."""
+    """Random observations; components depend on observation and action; ends at random and by a
+    time limit.
+    """
 
     def __init__(
         self,
@@ -42,7 +46,9 @@ class Env(gym.Env[Any, Any]):
         limit: int = 12,
         p_end: float = 0.05,
     ):
-        self.observation_space, self.action_space = deepcopy((OBSERVATIONS[observation], ACTIONS[action]))
+        self.observation_space, self.action_space = deepcopy(
+            (OBSERVATIONS[observation], ACTIONS[action])
+        )
         self.limit, self.p_end = limit, p_end
         self.n = 3 if spec is None else len(spec)
         if spec is not None:
@@ -64,11 +70,19 @@ class Env(gym.Env[Any, Any]):
         components = self.np_random.normal(size=self.n) + push * np.cos(3 * np.arange(self.n))
         terminated = bool(self.np_random.random() < self.p_end)
         truncated = self.t >= self.limit and not terminated
-        return self._observe(), float(components.sum()), terminated, truncated, {"reward_components": components}
+        return (
+            self._observe(),
+            float(components.sum()),
+            terminated,
+            truncated,
+            {"reward_components": components},
+        )
 
 
 class Valley(gym.Env[Any, Any]):
-    """One step: a task wants x = 1, a regulariser wants x = 0 (four times as much) and y = 0.5; the two fight over x alone."""
+    """One step: a task wants x = 1, a regulariser wants x = 0 (four times as much) and y = 0.5; the
+    two fight over x alone.
+    """
 
     observation_space = spaces.Box(-1, 1, (1,), np.float32)
     action_space = spaces.Box(-3, 3, (2,), np.float32)
@@ -81,7 +95,13 @@ class Valley(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         x, y = map(float, action)
         components = np.array([-((x - 1) ** 2), -4 * x**2 - (y - 0.5) ** 2])
-        return np.zeros(1, np.float32), float(components.sum()), True, False, {"reward_components": components}
+        return (
+            np.zeros(1, np.float32),
+            float(components.sum()),
+            True,
+            False,
+            {"reward_components": components},
+        )
 
 
 class Terms(gym.Env[Any, Any]):
@@ -122,7 +142,9 @@ class BatchedEnv(VecEnv):
         self.actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        self.reward_components[:] = self.rng.normal(size=(self.num_envs, 3))  # live: overwritten by every step
+        self.reward_components[:] = self.rng.normal(
+            size=(self.num_envs, 3)
+        )  # live: overwritten by every step
         rewards = self.reward_components.sum(1)
         return self.reset(), rewards, self.rng.random(self.num_envs) < 0.1, self.infos
 
@@ -134,7 +156,9 @@ class BatchedEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         setattr(self, attr_name, value)
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
+    ) -> list[Any]:
         raise NotImplementedError
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:

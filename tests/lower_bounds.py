@@ -1,4 +1,5 @@
-"""Print the exact lower bounds of the dependencies as pip constraints: ``make lower`` tests with them.
+"""Print the exact lower bounds of the dependencies as pip constraints: ``make lower`` tests with
+them.
 
 torch is left as in constraints.txt, because its old releases come with gigabytes of CUDA.
 """
@@ -18,7 +19,10 @@ def lower_bounds() -> list[str]:
     """One constraint per dependency of the core and of ``EXTRAS``."""
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
-    requirements = [config["options"]["install_requires"], *(config["options.extras_require"][name] for name in EXTRAS)]
+    requirements = [
+        config["options"]["install_requires"],
+        *(config["options.extras_require"][name] for name in EXTRAS),
+    ]
     found = re.findall(r"^([\w-]+)(?:\[\w+\])?>=([\d.]+)", "\n".join(requirements), re.M)
     torch = re.findall(r"^torch==.*$", (ROOT / "constraints.txt").read_text(), re.M)
     return [*(f"{name}=={version}" for name, version in found if name != "torch"), *torch]

@@ -1,4 +1,6 @@
-"""Independent oracles: naive loops in gradient space, written from the paper's words, with gradients instead of Gramians."""
+"""Independent oracles: naive loops in gradient space, written from the paper's words, with
+gradients instead of Gramians.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ from sb3_gcr.resolvers import visiting_order
 
 
 def pcgrad_with_levels(jacobian: Any, levels: Any, rng: np.random.Generator) -> Any:
-    """Each gradient, projected off every conflicting original gradient of its own or a higher level, in the given order."""
+    """Each gradient, projected off every conflicting original gradient of its own or a higher
+    level, in the given order.
+    """
     order = visiting_order(np.asarray(levels), rng)
     total = np.zeros(jacobian.shape[1])
     for i, mine in enumerate(jacobian):
@@ -26,7 +30,9 @@ def pcgrad_with_levels(jacobian: Any, levels: Any, rng: np.random.Generator) -> 
 
 
 def authors_in_place(jacobian: Any, levels: Any, rng: np.random.Generator) -> Any:
-    """One pass over all gradients, each projected off the tasks as the pass has left them so far."""
+    """One pass over all gradients, each projected off the tasks as the pass has left them so
+    far.
+    """
     gradients = jacobian.copy()
     n = len(gradients)
     for i in rng.permutation(n):

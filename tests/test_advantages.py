@@ -18,17 +18,35 @@ def test_gae_by_hand() -> None:
     rewards = np.array([[[1.0, 10.0]], [[2.0, 20.0]]])
     values = np.array([[[4.0, 40.0]], [[6.0, 60.0]]])
     advantages = component_gae(
-        rewards, values, np.zeros((2, 1)), np.array([[8.0, 80.0]]), np.array([False]), gamma=0.5, gae_lambda=0.5
+        rewards,
+        values,
+        np.zeros((2, 1)),
+        np.array([[8.0, 80.0]]),
+        np.array([False]),
+        gamma=0.5,
+        gae_lambda=0.5,
     )
     # δ_1 = 2 + 0.5·8 - 6 = 0, δ_0 = 1 + 0.5·6 - 4 = 0
     np.testing.assert_allclose(advantages, np.zeros((2, 1, 2)))
     ended = component_gae(
-        rewards, values, np.zeros((2, 1)), np.array([[8.0, 80.0]]), np.array([True]), gamma=0.5, gae_lambda=0.5
+        rewards,
+        values,
+        np.zeros((2, 1)),
+        np.array([[8.0, 80.0]]),
+        np.array([True]),
+        gamma=0.5,
+        gae_lambda=0.5,
     )
     # δ_1 = 2 - 6 = -4, A_0 = 0 + 0.25·(-4)
     np.testing.assert_allclose(ended[:, 0], [[-1, -10], [-4, -40]])
     new_episode = component_gae(
-        rewards, values, np.array([[0.0], [1.0]]), np.array([[8.0, 80.0]]), np.array([False]), gamma=0.5, gae_lambda=0.5
+        rewards,
+        values,
+        np.array([[0.0], [1.0]]),
+        np.array([[8.0, 80.0]]),
+        np.array([False]),
+        gamma=0.5,
+        gae_lambda=0.5,
     )
     # δ_0 = 1 - 4
     np.testing.assert_allclose(new_episode[:, 0], [[-3, -30], [0, 0]])
@@ -43,14 +61,20 @@ def test_each_component_is_sb3s_gae() -> None:
     box = gym.spaces.Box(-1, 1, (1,))
     for k in range(4):
         buffer = RolloutBuffer(7, box, box, gae_lambda=0.9, gamma=0.97, n_envs=3)
-        buffer.rewards, buffer.values, buffer.episode_starts = rewards[..., k], values[..., k], starts
+        buffer.rewards, buffer.values, buffer.episode_starts = (
+            rewards[..., k],
+            values[..., k],
+            starts,
+        )
         buffer.compute_returns_and_advantage(th.as_tensor(last_values[:, k]), dones)
         np.testing.assert_array_equal(advantages[..., k], buffer.advantages)
 
 
 def test_bootstrap_adds_the_terminal_value_of_each_head() -> None:
     rewards = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
-    result = bootstrap_truncations(rewards, np.array([True, False, True]), np.array([[10.0, 20.0], [30.0, 40.0]]), 0.5)
+    result = bootstrap_truncations(
+        rewards, np.array([True, False, True]), np.array([[10.0, 20.0], [30.0, 40.0]]), 0.5
+    )
     np.testing.assert_array_equal(result, [[6, 12], [3, 4], [20, 26]])
     np.testing.assert_array_equal(rewards, [[1, 2], [3, 4], [5, 6]])
 
@@ -80,7 +104,9 @@ def test_components_that_cancel_are_bounded(backend: Any) -> None:
 
 def test_bound_does_not_touch_components_that_do_not_cancel() -> None:
     advantages = np.random.default_rng(0).normal(size=(100, 5))
-    np.testing.assert_array_equal(normalize_jointly(advantages, kappa_max=10.0), normalize_jointly(advantages))
+    np.testing.assert_array_equal(
+        normalize_jointly(advantages, kappa_max=10.0), normalize_jointly(advantages)
+    )
 
 
 def test_the_sum_is_ppos_normalised_advantage() -> None:
@@ -88,7 +114,9 @@ def test_the_sum_is_ppos_normalised_advantage() -> None:
     advantages = rng.normal(size=(64, 4)) * [1, 10, 0.1, 3] + [1, -5, 0, 2]
     total = th.as_tensor(advantages.sum(1))
     ppo = (total - total.mean()) / (total.std() + 1e-8)
-    np.testing.assert_allclose(normalize_jointly(advantages).sum(1), ppo.numpy(), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        normalize_jointly(advantages).sum(1), ppo.numpy(), rtol=1e-9, atol=1e-12
+    )
 
 
 def test_rollout_shape_and_ratios_are_kept() -> None:

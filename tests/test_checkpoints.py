@@ -1,4 +1,6 @@
-"""Saving is crash-safe: files are the old ones or the new ones, and a training that is killed goes on from the last."""
+"""Saving is crash-safe: files are the old ones or the new ones, and a training that is killed goes
+on from the last.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_gcr import GCRPPO, checkpoints, latest_checkpoint
+from sb3_gcr import GCRPPO, latest_checkpoint
+from sb3_gcr.saving import checkpoints
 from tests.envs import Env
 
 ROOT = Path(__file__).parents[1]
@@ -45,7 +48,11 @@ def normalized(observation: str = "Box", **kwargs: Any) -> VecNormalize:
 
 def statistics(env: VecNormalize) -> Any:
     observations = getattr(env, "obs_rms", {})
-    moments = [*observations.values(), env.ret_rms] if isinstance(observations, dict) else [observations, env.ret_rms]
+    moments = (
+        [*observations.values(), env.ret_rms]
+        if isinstance(observations, dict)
+        else [observations, env.ret_rms]
+    )
     return np.concatenate([np.append(np.ravel((m.mean, m.var)), m.count) for m in moments])
 
 
@@ -66,7 +73,9 @@ class SaveLast(BaseCallback):
 
 
 def train_until_killed(folder: Path) -> None:
-    """A training that checkpoints at every step, two ways; almost all of its time goes into writing."""
+    """A training that checkpoints at every step, two ways; almost all of its time goes into
+    writing.
+    """
     env = normalized()
     checkpoint = latest_checkpoint(folder)
     if checkpoint is None:
@@ -80,7 +89,9 @@ def train_until_killed(folder: Path) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="needs fork")
 def test_a_training_killed_at_any_moment_goes_on(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("forkserver")  # imports once; its children start in milliseconds
+    context = multiprocessing.get_context(
+        "forkserver"
+    )  # imports once; its children start in milliseconds
     context.set_forkserver_preload(["torch._dynamo", "sb3_gcr", __name__])
     rng = np.random.default_rng()
     steps, n_interrupted = 0, 0
@@ -118,7 +129,9 @@ def test_a_training_killed_at_any_moment_goes_on(tmp_path: Path) -> None:
 # === What a crash leaves, moment by moment ===
 
 
-def test_an_error_while_saving_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_while_saving_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A full disk, or Ctrl-C."""
     model = GCRPPO("MlpPolicy", make_vec_env(Env, 1), **SMALL)
     model.save(tmp_path / "model")
@@ -138,7 +151,9 @@ def test_an_error_while_saving_leaves_the_old_file(tmp_path: Path, monkeypatch: 
         assert (tmp_path / "model.zip").read_bytes() == before
 
 
-def test_the_file_is_on_the_disk_before_it_gets_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_is_on_the_disk_before_it_gets_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls: list[str] = []
     for name in ("fsync", "replace"):
         function = getattr(os, name)
@@ -161,7 +176,10 @@ def test_names_are_those_of_sb3(tmp_path: Path) -> None:
     message = f"Path '{tmp_path / 'new'}' does not exist. Will create it."
     with pytest.warns(UserWarning, match=exactly(message)):
         model.save(tmp_path / "new" / "a")
-    message = f"Path '{tmp_path / 'folder.zip'}' is a folder. Will save instead to {tmp_path / 'folder.zip'}_2"
+    message = (
+        f"Path '{tmp_path / 'folder.zip'}' is a folder. Will save instead to "
+        f"{tmp_path / 'folder.zip'}_2"
+    )
     with pytest.warns(UserWarning, match=exactly(message)):
         model.save(str(tmp_path / "folder"))
     model.save(tmp_path / "b.model")
@@ -199,7 +217,10 @@ def test_sb3_reads_our_files_and_we_read_those_without_our_entry(tmp_path: Path)
     assert data is not None
     assert data["num_timesteps"] == 64
     assert set(loaded) == {"policy", "policy.optimizer"}
-    with zipfile.ZipFile(tmp_path / "new.zip") as new, zipfile.ZipFile(tmp_path / "old.zip", "w") as old:
+    with (
+        zipfile.ZipFile(tmp_path / "new.zip") as new,
+        zipfile.ZipFile(tmp_path / "old.zip", "w") as old,
+    ):
         assert json.loads(new.read("sb3_gcr.json"))["components"] == {"go": 0, "stay": 0, "save": 1}
         for name in set(new.namelist()) - {"sb3_gcr.json"}:
             old.writestr(name, new.read(name))
@@ -216,10 +237,17 @@ def test_sb3_reads_our_files_and_we_read_those_without_our_entry(tmp_path: Path)
 
 @pytest.mark.parametrize(
     ("observation", "kwargs"),
-    [("Box", {}), ("Box", {"norm_obs": False}), ("DictImage", {"norm_obs_keys": ["a"]}), ("Image", {"norm_reward": False})],
+    [
+        ("Box", {}),
+        ("Box", {"norm_obs": False}),
+        ("DictImage", {"norm_obs_keys": ["a"]}),
+        ("Image", {"norm_reward": False}),
+    ],
 )
 def test_statistics_come_back_exactly(tmp_path: Path, observation: str, kwargs: Any) -> None:
-    policy = {"Box": "MlpPolicy", "DictImage": "MultiInputPolicy", "Image": "MlpPolicy"}[observation]
+    policy = {"Box": "MlpPolicy", "DictImage": "MultiInputPolicy", "Image": "MlpPolicy"}[
+        observation
+    ]
     env = normalized(observation, **kwargs)
     model = GCRPPO(policy, env, **SMALL).learn(64)
     model.save(tmp_path / "model")
@@ -245,8 +273,13 @@ def test_a_vec_normalize_that_has_seen_something_keeps_its_own(tmp_path: Path) -
 
 
 def test_statistics_of_other_observations_are_refused(tmp_path: Path) -> None:
-    GCRPPO("MultiInputPolicy", normalized("DictImage", norm_obs_keys=["a"]), **SMALL).save(tmp_path / "model")
-    message = "VecNormalize must normalise the observations that it did for the saved model, ['a'], found ['i']."
+    GCRPPO("MultiInputPolicy", normalized("DictImage", norm_obs_keys=["a"]), **SMALL).save(
+        tmp_path / "model"
+    )
+    message = (
+        "VecNormalize must normalise the observations that it did for the saved model, ['a'], "
+        "found ['i']."
+    )
     env = normalized("DictImage", norm_obs_keys=["i"])
     env.observation_space = normalized("DictImage", norm_obs_keys=["a"]).observation_space
     with pytest.raises(ValueError, match=exactly(message)):

@@ -1,4 +1,6 @@
-"""The documentation: its Python blocks run, its links lead somewhere, and nothing public goes unexplained."""
+"""The documentation: its Python blocks run, its links lead somewhere, and nothing public goes
+unexplained.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ NEEDS = {
 #: Pages whose blocks other tests run, or that show scripts.
 ELSEWHERE = {"saving", "rl_zoo3"}
 #: A Python block, and the error or warning that follows it, if it is there to fail.
-BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:\n^```text\n(\w+(?:Error|Warning)): (.*?)\n^```)?", re.S | re.M)
+BLOCK = re.compile(
+    r"^```python\n(.*?)^```\n(?:\n^```text\n(\w+(?:Error|Warning)): (.*?)\n^```)?", re.S | re.M
+)
 KEY = re.compile(r"(?:gcr|train|rollout|time|curriculum)/[\w/]+")
 
 
@@ -40,14 +44,28 @@ def blocks(page: Path) -> list[tuple[str, str, str]]:
 
 def anchors(page: Path) -> set[str]:
     """The names that GitHub and MyST give to headings."""
-    headings = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M), re.M)
+    headings = re.findall(
+        r"^#+ (.*)$",
+        re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M),
+        re.M,
+    )
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.filterwarnings("ignore:::torch", "ignore:::onnxscript", "ignore:`isinstance:FutureWarning")
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page) and page.stem not in ELSEWHERE], ids=lambda p: p.stem)
-def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In one namespace, with a rollout or two and short updates; what stands before an error must raise it, … is anything."""
+@pytest.mark.filterwarnings(
+    "ignore:::torch", "ignore:::onnxscript", "ignore:`isinstance:FutureWarning"
+)
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if blocks(page) and page.stem not in ELSEWHERE],
+    ids=lambda p: p.stem,
+)
+def test_the_blocks_of_a_page_run(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one namespace, with a rollout or two and short updates; what stands before an error must
+    raise it, … is anything.
+    """
     for module in NEEDS.get(page.stem, []):
         pytest.importorskip(module)
     learn, n_rollouts = GCRPPO.learn, 2 if "write_report" in page.read_text(encoding="utf-8") else 1
@@ -57,7 +75,9 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytes
     def learn_a_little(self: GCRPPO, total_timesteps: int, *args: Any, **kwargs: Any) -> GCRPPO:
         self.n_epochs = 1
         learned.append(self)
-        return learn(self, min(total_timesteps, n_rollouts * self.n_steps * self.n_envs), *args, **kwargs)
+        return learn(
+            self, min(total_timesteps, n_rollouts * self.n_steps * self.n_envs), *args, **kwargs
+        )
 
     monkeypatch.setattr(GCRPPO, "learn", learn_a_little)
     monkeypatch.chdir(tmp_path)
@@ -78,7 +98,9 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytes
             model.logger.close()
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CHANGELOG.md"], ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "page", [*PAGES, ROOT / "README.md", ROOT / "CHANGELOG.md"], ids=lambda p: p.name
+)
 def test_links_lead_somewhere(page: Path) -> None:
     prose = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M)
     for link in re.findall(r"\]\(([^)\s]+)\)", prose):
@@ -88,7 +110,9 @@ def test_links_lead_somewhere(page: Path) -> None:
         target = (page.parent / name).resolve() if name else page
         assert target.exists(), f"{page.name} links to {link}"
         if anchor:
-            assert anchor in anchors(target), f"{page.name} links to {link}, found {sorted(anchors(target))}"
+            assert anchor in anchors(target), (
+                f"{page.name} links to {link}, found {sorted(anchors(target))}"
+            )
 
 
 def test_every_page_and_picture_is_in_the_site() -> None:
@@ -101,7 +125,10 @@ def test_every_page_and_picture_is_in_the_site() -> None:
     }
     assert listed == {page.stem for page in [*PAGES, *DOCS.glob("*.rst")]} - {"index"}
     shown = set(
-        re.findall(r"images/([\w.-]+)", "".join(page.read_text(encoding="utf-8") for page in [*PAGES, ROOT / "README.md"]))
+        re.findall(
+            r"images/([\w.-]+)",
+            "".join(page.read_text(encoding="utf-8") for page in [*PAGES, ROOT / "README.md"]),
+        )
     )
     assert shown == {picture.name for picture in (DOCS / "images").iterdir()}
 
@@ -120,7 +147,11 @@ def test_every_key_in_the_source_is_explained() -> None:
     text = explained()
     for path in sorted((ROOT / "sb3_gcr").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and KEY.fullmatch(node.value):
+            if (
+                isinstance(node, ast.Constant)
+                and isinstance(node.value, str)
+                and KEY.fullmatch(node.value)
+            ):
                 key = node.value + ("<name>" if node.value.endswith("/") else "")
                 assert f"`{key}`" in text or f"`{key}/<name>`" in text, f"{key} of {path.name}"
 
@@ -134,12 +165,17 @@ def test_every_key_of_a_run_is_explained(tmp_path: Path) -> None:
     names = "|".join(model.reward_spec.names)
     keys = {re.sub(rf"/(?:{names})$", "/<name>", key) for key in header}
     assert [key for key in sorted(keys) if f"`{key}`" not in explained()] == []
-    told = {re.sub(r"/reward_\w+$", "/<name>", key) for key in re.findall(r"`((?:gcr|train)/[\w/<>]+)`", explained())}
+    told = {
+        re.sub(r"/reward_\w+$", "/<name>", key)
+        for key in re.findall(r"`((?:gcr|train)/[\w/<>]+)`", explained())
+    }
     assert told - keys == {"gcr/cosines"}  # a picture, for TensorBoard alone
 
 
 def test_the_results_are_those_of_the_readme() -> None:
-    page, readme = ((path).read_text(encoding="utf-8") for path in (DOCS / "gcrppo.md", ROOT / "README.md"))
+    page, readme = (
+        (path).read_text(encoding="utf-8") for path in (DOCS / "gcrppo.md", ROOT / "README.md")
+    )
     rows = re.findall(r"^\| (?:PPO|`GCRPPO).*±.*$", page, re.M)
     assert len(rows) == 3
     assert all(row in readme for row in rows)

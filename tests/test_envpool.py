@@ -1,4 +1,6 @@
-"""EnvPool's envs as a VecEnv: components, ends of episodes, seeds, threads, and the words of every error."""
+"""EnvPool's envs as a VecEnv: components, ends of episodes, seeds, threads, and the words of every
+error.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +20,10 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_gcr import GCRPPO
-from sb3_gcr.components import SUM_TOLERANCE, ComponentReader, find_fault
-from sb3_gcr.envs.envpool import ENVPOOL_ENVS, EnvPoolVecEnv
-from sb3_gcr.envs.envpool_gym import pool_of
+from sb3_gcr.rewards.reading import ComponentReader
+from sb3_gcr.rewards.sums import SUM_TOLERANCE, find_fault
+from sb3_gcr.simulators.envpool import ENVPOOL_ENVS, EnvPoolVecEnv
+from sb3_gcr.simulators.envpool_gym import pool_of
 
 envpool = pytest.importorskip("envpool")
 
@@ -35,7 +38,9 @@ def exactly(message: str) -> str:
 def actions_of(env: VecEnv, steps: int, size: float = 1.0) -> NDArray[Any]:
     """Random actions of shape (T, N, A), the same for every env with these spaces."""
     space = env.action_space
-    draw = np.random.default_rng(0).uniform(size * space.low, size * space.high, (steps, env.num_envs, *space.shape))  # type: ignore[attr-defined]
+    draw = np.random.default_rng(0).uniform(
+        size * space.low, size * space.high, (steps, env.num_envs, *space.shape)
+    )  # type: ignore[attr-defined]
     return draw.astype(np.float32)
 
 
@@ -54,7 +59,12 @@ def spy(env: EnvPoolVecEnv, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     def recv(reset: bool = False, return_info: bool = True) -> Any:
         result = receive(reset, return_info)
         if not reset:
-            seen.append((result[1].copy(), {key: np.array(result[4][key]) for key in result[4] if key != "players"}))
+            seen.append(
+                (
+                    result[1].copy(),
+                    {key: np.array(result[4][key]) for key in result[4] if key != "players"},
+                )
+            )
         return result
 
     monkeypatch.setattr(env._pool, "recv", recv)
@@ -87,7 +97,9 @@ def test_terms_of_the_table_sum_to_the_reward(env_id: str, monkeypatch: pytest.M
             assert not any(info[key].any() for key in others)
         assert [bool(info) for info in infos] == list(dones)
     assert env.observation_space.contains(
-        {key: value[0] for key, value in observations.items()} if isinstance(observations, dict) else observations[0]
+        {key: value[0] for key, value in observations.items()}
+        if isinstance(observations, dict)
+        else observations[0]
     )
     env.close()
 
@@ -108,7 +120,9 @@ def test_clipped_rewards_are_paid_in_full(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_success_of_the_hand_is_not_times_the_time_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = EnvPoolVecEnv("LeapCubeReorient-v1", 1, num_threads=1, success_threshold=3.2, success_reward=7.0)
+    env = EnvPoolVecEnv(
+        "LeapCubeReorient-v1", 1, num_threads=1, success_threshold=3.2, success_reward=7.0
+    )
     env.reset()
     seen = spy(env, monkeypatch)
     rewards = env.step(actions_of(env, 1)[0])[1]
@@ -119,8 +133,14 @@ def test_success_of_the_hand_is_not_times_the_time_step(monkeypatch: pytest.Monk
 
 def test_weights_in_the_settings_choose_the_terms() -> None:
     assert "reward_torques" not in EnvPoolVecEnv("G1JoystickFlatTerrain-v1", 1).reward_spec.names
-    assert "reward_torques" in EnvPoolVecEnv("G1JoystickFlatTerrain-v1", 1, torques_scale=-1e-5).reward_spec.names
-    assert "reward_success" not in EnvPoolVecEnv("LeapCubeReorient-v1", 1, success_reward=0.0).reward_spec.names
+    assert (
+        "reward_torques"
+        in EnvPoolVecEnv("G1JoystickFlatTerrain-v1", 1, torques_scale=-1e-5).reward_spec.names
+    )
+    assert (
+        "reward_success"
+        not in EnvPoolVecEnv("LeapCubeReorient-v1", 1, success_reward=0.0).reward_spec.names
+    )
     aliased = EnvPoolVecEnv("MuJoCoPlayground/PandaPickCube-v1", 1)
     assert list(aliased.reward_spec) == list(EnvPoolVecEnv("PandaPickCube-v1", 1).reward_spec)
     np.testing.assert_allclose(aliased._factors, [4, 8, 0.25, 0.3])
@@ -137,12 +157,19 @@ def test_residual_takes_the_rest_of_the_reward(monkeypatch: pytest.MonkeyPatch) 
     np.testing.assert_array_equal(rewards, seen[0][0])
     np.testing.assert_allclose(env.reward_components.sum(1), rewards, rtol=1e-6)
     np.testing.assert_array_equal(env.reward_components[:, 0], seen[0][1]["reward_dist"])
-    assert EnvPoolVecEnv("Pusher-v4", 2, components=components, residual="rest").reward_spec.to_dict()["rest"] == 0
+    assert (
+        EnvPoolVecEnv("Pusher-v4", 2, components=components, residual="rest").reward_spec.to_dict()[
+            "rest"
+        ]
+        == 0
+    )
     env.close()
 
 
 def test_episodes_are_those_of_a_pool_without_our_resets() -> None:
-    """Until the first end of each env, and the start that follows it, EnvPool's own stepping shows the same."""
+    """Until the first end of each env, and the start that follows it, EnvPool's own stepping shows
+    the same.
+    """
     env = EnvPoolVecEnv("Humanoid-v5", 4, num_threads=2, seed=7)
     pool = envpool.make("Humanoid-v5", "gymnasium", num_envs=4, num_threads=2, seed=7)
     previous: Any = env.reset()
@@ -167,7 +194,9 @@ def test_episodes_are_those_of_a_pool_without_our_resets() -> None:
 
 @pytest.mark.parametrize("env_id", ["Humanoid-v5", "Go1JoystickFlatTerrain-v1"])
 def test_time_limits_and_statistics(env_id: str) -> None:
-    """Every step is counted once, what an end returns stays as it was, and its sums are those of the steps."""
+    """Every step is counted once, what an end returns stays as it was, and its sums are those of
+    the steps.
+    """
     env = EnvPoolVecEnv(env_id, 3, num_threads=1, max_episode_steps=20)
     assert env.env_is_wrapped(Monitor, indices=[0, 2]) == [True, True]
     assert env.env_is_wrapped(VecMonitor) == [False] * 3  # type: ignore[arg-type]
@@ -185,11 +214,15 @@ def test_time_limits_and_statistics(env_id: str) -> None:
         returns += env.reward_components
         for index in np.flatnonzero(dones):
             info, episode = infos[index], infos[index]["episode"]
-            kept.append((rows(info["terminal_observation"]), rows(info["terminal_observation"]).copy()))
+            kept.append(
+                (rows(info["terminal_observation"]), rows(info["terminal_observation"]).copy())
+            )
             assert not np.array_equal(rows(info["terminal_observation"]), rows(observations)[index])
             assert episode["l"] == info["elapsed_step"] == lengths[index]
             assert episode["r"] == pytest.approx(returns[index].sum(), abs=1e-4)
-            assert [episode[f"r_{name}"] for name in env.reward_spec.names] == pytest.approx(returns[index], abs=1e-5)
+            assert [episode[f"r_{name}"] for name in env.reward_spec.names] == pytest.approx(
+                returns[index], abs=1e-5
+            )
             assert isinstance(episode["r"], float)
             kinds.add((info["TimeLimit.truncated"], bool(lengths[index] == 20)))
         lengths[dones], returns[dones] = 0, 0
@@ -237,11 +270,21 @@ def test_seeds() -> None:
 
 
 @pytest.mark.parametrize(
-    ("env_id", "policy"), [("Humanoid-v5", "MlpPolicy"), ("Go1JoystickRoughTerrain-v1", "MultiInputPolicy")]
+    ("env_id", "policy"),
+    [("Humanoid-v5", "MlpPolicy"), ("Go1JoystickRoughTerrain-v1", "MultiInputPolicy")],
 )
 def test_gcrppo_trains(env_id: str, policy: str) -> None:
     env = EnvPoolVecEnv(env_id, 4, num_threads=1, max_episode_steps=15)
-    model = GCRPPO(policy, env, n_steps=16, batch_size=32, n_epochs=2, seed=1, policy_kwargs={"net_arch": [8]}, device="cpu")
+    model = GCRPPO(
+        policy,
+        env,
+        n_steps=16,
+        batch_size=32,
+        n_epochs=2,
+        seed=1,
+        policy_kwargs={"net_arch": [8]},
+        device="cpu",
+    )
     model.set_logger(configure(None, []))
     logged: list[dict[str, float]] = []
     model.logger.dump = lambda step=0: logged.append(dict(model.logger.name_to_value))  # type: ignore[method-assign]
@@ -281,7 +324,7 @@ def test_wrappers_on_top(wrapper: Any) -> None:
 def test_no_thread_is_left() -> None:
     code = """
 import os, numpy as np
-from sb3_gcr.envs.envpool import EnvPoolVecEnv
+from sb3_gcr.simulators.envpool import EnvPoolVecEnv
 env = EnvPoolVecEnv("HalfCheetah-v5", 4, num_threads=2)
 before = len(os.listdir("/proc/self/task"))
 for _ in range(2):
@@ -313,7 +356,15 @@ def test_imports_without_envpool(monkeypatch: pytest.MonkeyPatch) -> None:
 PUSHER = "['reward_ctrl', 'reward_dist', 'reward_near']"
 SETTINGS = sorted(
     set(envpool.make_spec("Pusher-v5").config._asdict())
-    - {"num_envs", "batch_size", "num_threads", "max_num_players", "seed", "env_seed", "gym_reset_return_info"}
+    - {
+        "num_envs",
+        "batch_size",
+        "num_threads",
+        "max_num_players",
+        "seed",
+        "env_seed",
+        "gym_reset_return_info",
+    }
 )
 
 
@@ -321,52 +372,81 @@ SETTINGS = sorted(
     ("arguments", "error", "message"),
     [
         ({"num_envs": 0}, ValueError, "Parameter `num_envs` must be an integer ≥ 1, found 0."),
-        ({"num_envs": True}, ValueError, "Parameter `num_envs` must be an integer ≥ 1, found True."),
-        ({"num_threads": 1.5}, ValueError, "Parameter `num_threads` must be an integer ≥ 1, found 1.5."),
-        ({"max_episode_steps": 0}, ValueError, "Parameter `max_episode_steps` must be an integer ≥ 1, found 0."),
+        (
+            {"num_envs": True},
+            ValueError,
+            "Parameter `num_envs` must be an integer ≥ 1, found True.",
+        ),
+        (
+            {"num_threads": 1.5},
+            ValueError,
+            "Parameter `num_threads` must be an integer ≥ 1, found 1.5.",
+        ),
+        (
+            {"max_episode_steps": 0},
+            ValueError,
+            "Parameter `max_episode_steps` must be an integer ≥ 1, found 0.",
+        ),
         ({"seed": -1}, ValueError, "Parameter `seed` must be None or an integer ≥ 0, found -1."),
         ({"seed": 0.5}, ValueError, "Parameter `seed` must be None or an integer ≥ 0, found 0.5."),
         (
             {"env_id": "Ant-v9"},
             ValueError,
-            f"Parameter `env_id` must be an id of EnvPool, found 'Ant-v9': valid choices are {IDS}, "
+            "Parameter `env_id` must be an id of EnvPool, found 'Ant-v9': valid choices are "
+            f"{IDS}, "
             "and with `components` others of `envpool.list_all_envs()`.",
         ),
         (
             {"env_id": "Hopper-v5"},
             ValueError,
-            "Parameter `env_id` must be an env that reports the terms of its reward, found 'Hopper-v5': "
+            "Parameter `env_id` must be an env that reports the terms of its reward, found "
+            "'Hopper-v5': "
             f"valid choices are {IDS}.",
         ),
         (
             {"env_id": "Reacher-v4"},
             ValueError,
-            f"Parameter `components` must be given for 'Reacher-v4': levels are known only for {IDS}. "
+            "Parameter `components` must be given for 'Reacher-v4': levels are known only for "
+            f"{IDS}. "
             "The terms in its info are ['reward_ctrl', 'reward_dist'].",
         ),
         (
             {"components": {"reward_speed": "task"}},
             ValueError,
-            f"Parameter `components` must name keys of the info, found 'reward_speed': valid choices are {PUSHER}.",
+            "Parameter `components` must name keys of the info, found 'reward_speed': valid "
+            f"choices are {PUSHER}.",
         ),
         (
             {"components": ["reward_near"]},
             TypeError,
             "Parameter `components` must map names to levels, found ['reward_near'].",
         ),
-        ({"components": {}}, ValueError, "Parameter `names` must name at least one reward component, found none."),
+        (
+            {"components": {}},
+            ValueError,
+            "Parameter `names` must name at least one reward component, found none.",
+        ),
         (
             {"components": {"reward_dist": "boss"}},
             ValueError,
             "Unknown level 'boss' of reward component 'reward_dist': valid choices are "
             "['regulariser', 'regularizer', 'task'] and integers from 0 (highest priority) on.",
         ),
-        ({"residual": 3}, ValueError, "Parameter `residual` must be a name or {name: level}, found 3."),
-        ({"batch_size": 1}, TypeError, f"'Pusher-v5' has no setting `batch_size`: valid choices are {SETTINGS}."),
+        (
+            {"residual": 3},
+            ValueError,
+            "Parameter `residual` must be a name or {name: level}, found 3.",
+        ),
+        (
+            {"batch_size": 1},
+            TypeError,
+            f"'Pusher-v5' has no setting `batch_size`: valid choices are {SETTINGS}.",
+        ),
         (
             {"ctrl_cost_weight": "high"},
             TypeError,
-            "EnvPool's settings of 'Pusher-v5' must have the types of their defaults, found {'ctrl_cost_weight': 'high'}.",
+            "EnvPool's settings of 'Pusher-v5' must have the types of their defaults, found "
+            "{'ctrl_cost_weight': 'high'}.",
         ),
     ],
 )
@@ -382,7 +462,9 @@ def test_misuse() -> None:
     env.reset()
     with pytest.raises(RuntimeError, match=exactly("`step_wait` must follow `step_async`.")):
         env.step_wait()
-    with pytest.raises(ValueError, match=exactly("Parameter `actions` must have shape (2, 7), found (7,).")):
+    with pytest.raises(
+        ValueError, match=exactly("Parameter `actions` must have shape (2, 7), found (7,).")
+    ):
         env.step(np.zeros(7))
     env.step_async(np.zeros((2, 7)))
     env.reset()  # gives the pending step up
@@ -390,16 +472,24 @@ def test_misuse() -> None:
     with pytest.raises(AttributeError):
         env.get_attr("spec")
     assert env.get_attr("env_id", indices=0) == ["Pusher-v5"]
-    message = "EnvPool's envs take their settings at construction: EnvPoolVecEnv(..., ctrl_cost_weight=...)."
+    message = (
+        "EnvPool's envs take their settings at construction: EnvPoolVecEnv(..., "
+        "ctrl_cost_weight=...)."
+    )
     with pytest.raises(NotImplementedError, match=exactly(message)):
         env.set_attr("ctrl_cost_weight", 1.0)
-    with pytest.raises(NotImplementedError, match=exactly("EnvPool's envs have no Python methods, found a call of 'jump'.")):
+    with pytest.raises(
+        NotImplementedError,
+        match=exactly("EnvPool's envs have no Python methods, found a call of 'jump'."),
+    ):
         env.env_method("jump")
     env.close()
 
 
 def test_gymnasium_ids_make_one_env_with_the_same_numbers() -> None:
-    """Observations, rewards, terms and ends of one env are those of the pool, over several episodes."""
+    """Observations, rewards, terms and ends of one env are those of the pool, over several
+    episodes.
+    """
     env = gym.make("envpool/Humanoid-v5")
     pool = EnvPoolVecEnv("Humanoid-v5", 1, 1, seed=5)
     first, rows = env.reset(seed=5)[0], pool.reset()
@@ -414,7 +504,9 @@ def test_gymnasium_ids_make_one_env_with_the_same_numbers() -> None:
         np.testing.assert_array_equal(info["reward_components"], pool.reward_components[0])
         if dones[0]:
             np.testing.assert_array_equal(first, infos[0]["terminal_observation"])
-            assert info["r_reward_quadctrl"] == pytest.approx(infos[0]["r_reward_quadctrl"], abs=1e-5)
+            assert info["r_reward_quadctrl"] == pytest.approx(
+                infos[0]["r_reward_quadctrl"], abs=1e-5
+            )
             first, rows = env.reset(seed=n_ended)[0], (pool.seed(n_ended), pool.reset())[1]
             n_ended += 1
     assert n_ended >= 2
@@ -425,8 +517,15 @@ def test_gymnasium_ids_make_one_env_with_the_same_numbers() -> None:
 @pytest.mark.filterwarnings("ignore:.*render_mode")  # make_vec_env asks for pictures
 def test_pool_of_refuses_what_it_would_lose() -> None:
     with pytest.raises(ValueError, match="so the wrapper ClipAction would never run"):
-        make_vec_env("envpool/Ant-v5", 2, wrapper_class=gym.wrappers.ClipAction, vec_env_cls=pool_of)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"needs an env of EnvPool, such as 'envpool/Humanoid-v5', found PendulumEnv\."):
+        make_vec_env(
+            "envpool/Ant-v5", 2, wrapper_class=gym.wrappers.ClipAction, vec_env_cls=pool_of
+        )  # type: ignore[arg-type]
+    with pytest.raises(
+        ValueError,
+        match=r"needs an env of EnvPool, such as 'envpool/Humanoid-v5', found PendulumEnv\.",
+    ):
         make_vec_env("Pendulum-v1", 2, vec_env_cls=pool_of)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="Parameter `seed` must be None or an integer ≥ 0, found -3"):
+    with pytest.raises(
+        ValueError, match="Parameter `seed` must be None or an integer ≥ 0, found -3"
+    ):
         EnvPoolVecEnv("Ant-v5", 2).seed(-3)

@@ -1,4 +1,6 @@
-"""The engine and its three faces: equal to Gymnasium's envs, to each other, and clean in trouble."""
+"""The engine and its three faces: equal to Gymnasium's envs, to each other, and clean in
+trouble.
+"""
 
 from __future__ import annotations
 
@@ -19,23 +21,31 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor, load_results
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecEnv,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
 mujoco_batch = pytest.importorskip("mujoco.batch")
 
 from sb3_gcr import GCRPPO  # noqa: E402
-from sb3_gcr.components import GYMNASIUM_ENVS  # noqa: E402
 from sb3_gcr.envs import BatchedVecEnv  # noqa: E402
 from sb3_gcr.envs.engine import Engine  # noqa: E402
 from sb3_gcr.envs.single import TaskEnv  # noqa: E402
-from sb3_gcr.envs.tasks import TASKS, make_task  # noqa: E402
+from sb3_gcr.envs.tasks.catalogue import TASKS, make_task  # noqa: E402
+from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS  # noqa: E402
 
 PLANAR = ["HalfCheetah", "Hopper", "Swimmer", "Walker2d"]
 ALL_OBJECTIVES = {"HumanoidMO": {"energy": 2, "gait": 1, "baseh": 3, "armsp": 2}}
 RUN = "sb3_gcr/HumanoidRun-v0"
 
 
-def batched(name: str, n_envs: int, seed: int | None = 0, n_threads: int = 2, **kwargs: Any) -> BatchedVecEnv:
+def batched(
+    name: str, n_envs: int, seed: int | None = 0, n_threads: int = 2, **kwargs: Any
+) -> BatchedVecEnv:
     return make_vec_env(  # type: ignore[return-value]
         f"sb3_gcr/{name}-v0",
         n_envs,
@@ -48,13 +58,18 @@ def batched(name: str, n_envs: int, seed: int | None = 0, n_threads: int = 2, **
 
 def random_actions(space: gym.spaces.Box, n: int, steps: int, seed: int = 0) -> list[np.ndarray]:
     rng = np.random.default_rng(seed)
-    return [rng.uniform(space.low, space.high, (n, *space.shape)).astype(space.dtype) for _ in range(steps)]
+    return [
+        rng.uniform(space.low, space.high, (n, *space.shape)).astype(space.dtype)
+        for _ in range(steps)
+    ]
 
 
 def steps_alike(
     ours: BatchedVecEnv, theirs: VecEnv, n_steps: int, terms: Callable[[dict[str, Any]], Any]
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Step both with the same random actions; everything must be equal. The infos of finished episodes, ours and theirs."""
+    """Step both with the same random actions; everything must be equal. The infos of finished
+    episodes, ours and theirs.
+    """
     np.testing.assert_array_equal(ours.reset(), theirs.reset())
     ended = []
     for actions in random_actions(ours.action_space, ours.num_envs, n_steps):  # type: ignore[arg-type]
@@ -65,7 +80,9 @@ def steps_alike(
         np.testing.assert_array_equal(dones, expected[2])
         np.testing.assert_array_equal(ours.reward_components, [terms(info) for info in expected[3]])
         for index in np.flatnonzero(dones):
-            np.testing.assert_array_equal(infos[index]["terminal_observation"], expected[3][index]["terminal_observation"])
+            np.testing.assert_array_equal(
+                infos[index]["terminal_observation"], expected[3][index]["terminal_observation"]
+            )
             assert infos[index]["TimeLimit.truncated"] == expected[3][index]["TimeLimit.truncated"]
             ended.append((infos[index], expected[3][index]))
     return ended
@@ -120,18 +137,25 @@ def test_gymnasiums_vector_env_is_the_sync_one(name: str) -> None:
         if (result[2] | result[3]).any():
             np.testing.assert_array_equal(result[4]["_final_obs"], expected[4]["_final_obs"])
             for index in np.flatnonzero(result[4]["_final_obs"]):
-                np.testing.assert_array_equal(result[4]["final_obs"][index], expected[4]["final_obs"][index])
                 np.testing.assert_array_equal(
-                    result[4]["final_info"]["reward_components"][index], expected[4]["final_info"]["reward_components"][index]
+                    result[4]["final_obs"][index], expected[4]["final_obs"][index]
                 )
-    with pytest.raises(ValueError, match="Parameter `seed` must be an integer or have 3 entries, found 2"):
+                np.testing.assert_array_equal(
+                    result[4]["final_info"]["reward_components"][index],
+                    expected[4]["final_info"]["reward_components"][index],
+                )
+    with pytest.raises(
+        ValueError, match="Parameter `seed` must be an integer or have 3 entries, found 2"
+    ):
         ours.reset(seed=[1, 2])
     ours.close()
     theirs.close()
 
 
 @pytest.mark.parametrize("name", list(TASKS))
-def test_env_passes_the_checks_of_gymnasium_and_sb3(name: str, recwarn: pytest.WarningsRecorder) -> None:
+def test_env_passes_the_checks_of_gymnasium_and_sb3(
+    name: str, recwarn: pytest.WarningsRecorder
+) -> None:
     env = gym.make(f"sb3_gcr/{name}-v0", **ALL_OBJECTIVES.get(name, {}))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("warnings.filters", [])  # some say that unbounded observations are unusual
@@ -150,10 +174,14 @@ def test_env_can_be_copied_and_pickled() -> None:
 def test_wrappers_of_sb3_work_on_top() -> None:
     with pytest.warns(UserWarning, match="already wrapped with a `Monitor`"):
         env = VecFrameStack(VecNormalize(VecMonitor(batched("HumanoidRun", 4))), 2)
-    model = GCRPPO("MlpPolicy", env, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs={"net_arch": [16]}).learn(512)
+    model = GCRPPO(
+        "MlpPolicy", env, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs={"net_arch": [16]}
+    ).learn(512)
     assert model.n_objectives == 7
     returns = np.mean(model.ep_component_buffer, axis=0)
-    assert returns[1] == pytest.approx(2 * np.mean([episode["l"] for episode in model.ep_info_buffer]), rel=1e-6)  # type: ignore[union-attr]
+    assert returns[1] == pytest.approx(
+        2 * np.mean([episode["l"] for episode in model.ep_info_buffer]), rel=1e-6
+    )  # type: ignore[union-attr]
 
 
 def test_terminal_observation_is_no_view() -> None:
@@ -173,7 +201,9 @@ def test_terminal_observation_is_no_view() -> None:
 
 def test_monitor_is_taken_over(tmp_path: Path) -> None:
     keywords = ("r_progress", "r_alive")
-    env = batched("HumanoidRun", 8, monitor_dir=str(tmp_path), monitor_kwargs={"info_keywords": keywords})
+    env = batched(
+        "HumanoidRun", 8, monitor_dir=str(tmp_path), monitor_kwargs={"info_keywords": keywords}
+    )
     assert env.env_is_wrapped(Monitor) == [True] * 8
     env.reset()
     for actions in random_actions(env.action_space, 8, 100):  # type: ignore[arg-type]
@@ -188,18 +218,27 @@ def test_monitor_is_taken_over(tmp_path: Path) -> None:
 def test_other_wrappers_and_envs_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="so the wrapper ClipAction would never run"):
         batched("HumanoidRun", 2, wrapper_class=gym.wrappers.ClipAction)
-    with pytest.raises(ValueError, match=r"BatchedVecEnv needs a task of sb3_gcr, .* found PendulumEnv\."):
+    with pytest.raises(
+        ValueError, match=r"BatchedVecEnv needs a task of sb3_gcr, .* found PendulumEnv\."
+    ):
         make_vec_env("Pendulum-v1", 2, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="Parameter `env_fns` must contain at least one function, found none"):
+    with pytest.raises(
+        ValueError, match="Parameter `env_fns` must contain at least one function, found none"
+    ):
         BatchedVecEnv([])
-    with pytest.raises(ValueError, match="Parameter `n_threads` must be at least 1, or None for all CPUs, found 0"):
+    with pytest.raises(
+        ValueError, match="Parameter `n_threads` must be at least 1, or None for all CPUs, found 0"
+    ):
         batched("HumanoidRun", 2, n_threads=0)
     with pytest.raises(ValueError, match="Parameter `n_simulations` must be at least 1, found 0"):
         Engine(make_task("Hopper"), 0)
-    with pytest.raises(ValueError, match=r"Parameter `task` must be one of \['HumanoidRun', .* found 'Fly'"):
+    with pytest.raises(
+        ValueError, match=r"Parameter `task` must be one of \['HumanoidRun', .* found 'Fly'"
+    ):
         make_task("Fly")
     with pytest.raises(
-        ValueError, match=r"Parameter `render_mode` must be one of \['human', 'rgb_array'\] or None, found 'x'"
+        ValueError,
+        match=r"Parameter `render_mode` must be one of \['human', 'rgb_array'\] or None, found 'x'",
     ):
         TaskEnv("HumanoidRun", render_mode="x")
 
@@ -215,7 +254,10 @@ def test_simulations_share_one_task() -> None:
 
 
 def test_a_diverged_simulation_ends_its_own_episode_only() -> None:
-    env, twin = batched("HumanoidMO", 4, env_kwargs={"baseh": 3}), batched("HumanoidMO", 4, env_kwargs={"baseh": 3})
+    env, twin = (
+        batched("HumanoidMO", 4, env_kwargs={"baseh": 3}),
+        batched("HumanoidMO", 4, env_kwargs={"baseh": 3}),
+    )
     env.reset()
     twin.reset()
     for step, actions in enumerate(random_actions(env.action_space, 4, 6)):  # type: ignore[arg-type]
@@ -241,10 +283,15 @@ def test_a_diverged_simulation_ends_its_own_episode_only() -> None:
 def test_steps_that_cannot_be_made_are_refused() -> None:
     env = batched("Hopper", 3)
     actions = np.zeros((3, 3), dtype=np.float32)
-    with pytest.raises(RuntimeError, match="BatchedVecEnv must be reset before a step, and cannot step after `close`"):
+    with pytest.raises(
+        RuntimeError,
+        match="BatchedVecEnv must be reset before a step, and cannot step after `close`",
+    ):
         env.step(actions)
     env.reset()
-    with pytest.raises(ValueError, match=r"Parameter `actions` must have shape \(3, 3\), found \(3,\)"):
+    with pytest.raises(
+        ValueError, match=r"Parameter `actions` must have shape \(3, 3\), found \(3,\)"
+    ):
         env.step(actions[0])
     env.close()
     with pytest.raises(RuntimeError, match="cannot step after `close`"):
@@ -270,12 +317,18 @@ def test_divergence_is_logged() -> None:
     env.engine.n_diverged = 3
     logged = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Logger, "dump", lambda self, step=0: logged.append(self.name_to_value["rollout/n_diverged"]))
+        patch.setattr(
+            Logger,
+            "dump",
+            lambda self, step=0: logged.append(self.name_to_value["rollout/n_diverged"]),
+        )
         model.learn(64)
     assert logged == [3]
 
 
-def test_an_error_in_one_simulation_leaves_the_others_their_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_in_one_simulation_leaves_the_others_their_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     env, twin = batched("Hopper", 3), batched("Hopper", 3)
     env.reset()
     twin.reset()
@@ -299,14 +352,20 @@ def test_closing_leaves_no_thread() -> None:
         "import os, numpy as np; from sb3_gcr.envs import BatchedVecEnv\n"
         "from stable_baselines3.common.env_util import make_vec_env\n"
         "threads = lambda: len(os.listdir('/proc/self/task'))\n"
-        f"make = lambda: make_vec_env('{RUN}', 8, vec_env_cls=BatchedVecEnv, vec_env_kwargs={{'n_threads': 3}})\n"
+        f"make = lambda: make_vec_env('{RUN}', 8, vec_env_cls=BatchedVecEnv, "
+        f"vec_env_kwargs={{'n_threads': 3}})\n"
         "make().close(); before = threads()\n"
-        "env = make(); env.reset(); env.step(np.zeros((8, 17))); during = threads(); env.close(); env.close()\n"
+        "env = make(); env.reset(); env.step(np.zeros((8, 17))); during = threads(); env.close(); "
+        "env.close()\n"
         "print(during - before, threads() - before)"
     )
     if not Path("/proc/self/task").exists():
         pytest.skip("needs /proc")
     result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     assert result.stdout.split() == ["2", "0"]

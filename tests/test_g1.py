@@ -40,7 +40,9 @@ def simulate(data: Any, seconds: float) -> Any:
 
 
 def touched(data: Any) -> set[str]:
-    names = {MODEL.sensor(index).name for index in range(MODEL.nsensor) if data.sensor(index).data[0] > 0}
+    names = {
+        MODEL.sensor(index).name for index in range(MODEL.nsensor) if data.sensor(index).data[0] > 0
+    }
     return {name.removeprefix("touch_") for name in names}
 
 
@@ -61,11 +63,18 @@ def test_it_has_a_robot_a_ball_and_a_target() -> None:
 
 
 def test_it_keeps_the_notice_of_whom_the_numbers_come_from() -> None:
-    assert 'Copyright (c) 2016-2023 HangZhou YuShu TECHNOLOGY CO.,LTD. ("Unitree Robotics")' in PATH.read_text()
+    assert (
+        'Copyright (c) 2016-2023 HangZhou YuShu TECHNOLOGY CO.,LTD. ("Unitree Robotics")'
+        in PATH.read_text()
+    )
 
 
 def test_joints_and_actuators_have_the_same_names_in_the_same_order() -> None:
-    assert [MODEL.joint(index).name for index in range(MODEL.njnt)] == ["floating_base_joint", *JOINTS, "ball_joint"]
+    assert [MODEL.joint(index).name for index in range(MODEL.njnt)] == [
+        "floating_base_joint",
+        *JOINTS,
+        "ball_joint",
+    ]
     assert [MODEL.actuator(index).name for index in range(MODEL.nu)] == JOINTS
     np.testing.assert_array_equal(MODEL.actuator_trnid[:, 0], np.arange(1, 38))
 
@@ -74,7 +83,13 @@ def test_joints_and_actuators_have_the_same_names_in_the_same_order() -> None:
     ("name", "parent", "position", "mass", "inertia"),
     [
         ("pelvis", "world", (0, 0, 0.755), 2.86, (0.0079143, 0.0069837, 0.0059404)),
-        ("left_hip_pitch_link", "pelvis", (0, 0.06445, -0.1027), 1.299, (0.00138785, 0.000955478, 0.00086947)),
+        (
+            "left_hip_pitch_link",
+            "pelvis",
+            (0, 0.06445, -0.1027),
+            1.299,
+            (0.00138785, 0.000955478, 0.00086947),
+        ),
         (
             "right_knee_link",
             "right_hip_yaw_link",
@@ -82,13 +97,33 @@ def test_joints_and_actuators_have_the_same_names_in_the_same_order() -> None:
             2.252,
             (0.0127418, 0.0124382, 0.00192524),
         ),
-        ("left_ankle_roll_link", "left_ankle_pitch_link", (0, 0, -0.017558), 0.391, (0.00110394, 0.0010657, 0.000149255)),
+        (
+            "left_ankle_roll_link",
+            "left_ankle_pitch_link",
+            (0, 0, -0.017558),
+            0.391,
+            (0.00110394, 0.0010657, 0.000149255),
+        ),
         ("torso_link", "pelvis", (0, 0, 0), 7.52036, (0.12848, 0.111753, 0.0350394)),
-        ("right_elbow_roll_link", "right_elbow_pitch_link", (0.1, 0, 0), 0.50826, (0.00239763, 0.00226639, 0.000285577)),
-        ("right_two_link", "right_one_link", (0, 0.0431, 0), 0.0138584, (2.55338e-06, 2.04399e-06, 9.3995e-07)),
+        (
+            "right_elbow_roll_link",
+            "right_elbow_pitch_link",
+            (0.1, 0, 0),
+            0.50826,
+            (0.00239763, 0.00226639, 0.000285577),
+        ),
+        (
+            "right_two_link",
+            "right_one_link",
+            (0, 0.0431, 0),
+            0.0138584,
+            (2.55338e-06, 2.04399e-06, 9.3995e-07),
+        ),
     ],
 )
-def test_bodies_weigh_and_sit_where_the_source_says(name: str, parent: str, position: Any, mass: float, inertia: Any) -> None:
+def test_bodies_weigh_and_sit_where_the_source_says(
+    name: str, parent: str, position: Any, mass: float, inertia: Any
+) -> None:
     body = MODEL.body(name)
     assert MODEL.body(body.parentid[0]).name == parent
     np.testing.assert_allclose(body.pos, position)
@@ -119,7 +154,12 @@ def test_bodies_weigh_and_sit_where_the_source_says(name: str, parent: str, posi
     ],
 )
 def test_a_joint_has_the_limits_of_the_source_and_the_gains_of_isaaclab(
-    name: str, limits: tuple[float, float], armature: float, stiffness: float, damping: float, effort: float
+    name: str,
+    limits: tuple[float, float],
+    armature: float,
+    stiffness: float,
+    damping: float,
+    effort: float,
 ) -> None:
     joint, actuator = MODEL.joint(f"{name}_joint"), MODEL.actuator(f"{name}_joint")
     np.testing.assert_array_equal(joint.range, limits)
@@ -140,8 +180,12 @@ def test_left_and_right_mirror_each_other() -> None:
         np.testing.assert_allclose(left.inertia, right.inertia)
         n_geoms = left.geomnum[0]
         assert right.geomnum[0] == n_geoms
-        of_left, of_right = (slice(body.geomadr[0], body.geomadr[0] + n_geoms) for body in (left, right))
-        np.testing.assert_allclose(MODEL.geom_pos[of_left] * across, MODEL.geom_pos[of_right], atol=1e-9)
+        of_left, of_right = (
+            slice(body.geomadr[0], body.geomadr[0] + n_geoms) for body in (left, right)
+        )
+        np.testing.assert_allclose(
+            MODEL.geom_pos[of_left] * across, MODEL.geom_pos[of_right], atol=1e-9
+        )
         np.testing.assert_allclose(MODEL.geom_size[of_left], MODEL.geom_size[of_right])
         np.testing.assert_array_equal(MODEL.geom_contype[of_left], MODEL.geom_contype[of_right])
         limits = MODEL.joint(f"left_{name}_joint").range, MODEL.joint(f"right_{name}_joint").range
@@ -149,8 +193,13 @@ def test_left_and_right_mirror_each_other() -> None:
         np.testing.assert_allclose(limits[0], limits[1] if is_pitch else -limits[1][::-1])
 
 
-@pytest.mark.parametrize(("keyframe", "pelvis", "hip", "sole"), [("default", 0.74, 0.637, 0.022), ("stand", 0.718, 0.615, 0)])
-def test_it_stands_as_high_as_the_source(keyframe: str, pelvis: float, hip: float, sole: float) -> None:
+@pytest.mark.parametrize(
+    ("keyframe", "pelvis", "hip", "sole"),
+    [("default", 0.74, 0.637, 0.022), ("stand", 0.718, 0.615, 0)],
+)
+def test_it_stands_as_high_as_the_source(
+    keyframe: str, pelvis: float, hip: float, sole: float
+) -> None:
     data = start(keyframe)
     soles = [
         data.geom(geom).xpos[2] - MODEL.geom(geom).size[0]
@@ -161,16 +210,26 @@ def test_it_stands_as_high_as_the_source(keyframe: str, pelvis: float, hip: floa
     assert min(soles) == pytest.approx(sole, abs=2e-4)
     assert data.body("pelvis").xpos[2] == pytest.approx(pelvis, abs=5e-4)
     assert data.body("left_hip_pitch_link").xpos[2] == pytest.approx(hip, abs=5e-4)
-    assert data.site("left_palm").xpos[2] == pytest.approx(0.638 - 0.74 + data.body("pelvis").xpos[2], abs=5e-4)
+    assert data.site("left_palm").xpos[2] == pytest.approx(
+        0.638 - 0.74 + data.body("pelvis").xpos[2], abs=5e-4
+    )
 
 
 @pytest.mark.parametrize("keyframe", ["default", "stand"])
 def test_keyframes_are_the_default_pose_and_ask_for_it(keyframe: str) -> None:
     pose = {name: 0.0 for name in JOINTS}
     for side, sign in (("left", 1), ("right", -1)):
-        pose |= {f"{side}_hip_pitch_joint": -0.2, f"{side}_knee_joint": 0.42, f"{side}_ankle_pitch_joint": -0.23}
+        pose |= {
+            f"{side}_hip_pitch_joint": -0.2,
+            f"{side}_knee_joint": 0.42,
+            f"{side}_ankle_pitch_joint": -0.23,
+        }
         pose |= {f"{side}_shoulder_pitch_joint": 0.35, f"{side}_shoulder_roll_joint": 0.16 * sign}
-        pose |= {f"{side}_elbow_pitch_joint": 0.87, f"{side}_one_joint": 1.0 * sign, f"{side}_two_joint": 0.52 * sign}
+        pose |= {
+            f"{side}_elbow_pitch_joint": 0.87,
+            f"{side}_one_joint": 1.0 * sign,
+            f"{side}_two_joint": 0.52 * sign,
+        }
     np.testing.assert_array_equal(MODEL.key(keyframe).qpos[7:44], list(pose.values()))
     np.testing.assert_array_equal(MODEL.key(keyframe).ctrl, list(pose.values()))
 
@@ -210,7 +269,10 @@ def test_a_body_knows_whether_it_touches_the_floor() -> None:
         expected = {MODEL.body(MODEL.geom_bodyid[geom]).name for geom in geoms}
         expected = {name for name in expected if "ankle" not in name}
         for side in ("left", "right"):
-            if f"{side}_elbow_roll_link" in expected and MODEL.geom(f"{side}_forearm").id not in geoms:
+            if (
+                f"{side}_elbow_roll_link" in expected
+                and MODEL.geom(f"{side}_forearm").id not in geoms
+            ):
                 expected.remove(f"{side}_elbow_roll_link")
             expected |= {f"{side}_palm"} if MODEL.geom(f"{side}_palm").id in geoms else set()
         expected |= {"head"} if MODEL.geom("head").id in geoms else set()
@@ -220,7 +282,11 @@ def test_a_body_knows_whether_it_touches_the_floor() -> None:
 
 
 def test_every_body_that_can_touch_the_floor_and_is_no_foot_has_a_sensor() -> None:
-    can_touch = {MODEL.body(MODEL.geom_bodyid[g]).name for g in range(MODEL.ngeom) if is_robots(g) and MODEL.geom_contype[g]}
+    can_touch = {
+        MODEL.body(MODEL.geom_bodyid[g]).name
+        for g in range(MODEL.ngeom)
+        if is_robots(g) and MODEL.geom_contype[g]
+    }
     feet = {"left_ankle_roll_link", "right_ankle_roll_link"}
     sensors = {MODEL.sensor(index).name.removeprefix("touch_") for index in range(MODEL.nsensor)}
     assert sensors == can_touch - feet | {"head", "left_palm", "right_palm"}
@@ -249,7 +315,9 @@ def test_grip_holds_the_ball_while_the_arm_swings_and_lets_it_go() -> None:
     height, rise = data.joint("ball_joint").qpos[2], data.joint("ball_joint").qvel[2]
     simulate(data, 0.1)
     assert grip_error(data) > 0.03
-    assert data.joint("ball_joint").qpos[2] == pytest.approx(height + 0.1 * rise - 9.81 * 0.1**2 / 2, abs=0.005)
+    assert data.joint("ball_joint").qpos[2] == pytest.approx(
+        height + 0.1 * rise - 9.81 * 0.1**2 / 2, abs=0.005
+    )
 
 
 def test_random_actions_keep_it_finite() -> None:

@@ -13,7 +13,12 @@ import pandas as pd
 import pytest
 import torch as th
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CheckpointCallback,
+    EvalCallback,
+    StopTrainingOnMaxEpisodes,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
@@ -21,7 +26,14 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 from torch import nn
 
-from sb3_gcr import GCRPPO, RESOLVERS, RewardDecomposition, RewardSpec, VectorRolloutBuffer, evaluate_components
+from sb3_gcr import (
+    GCRPPO,
+    RESOLVERS,
+    RewardDecomposition,
+    RewardSpec,
+    VectorRolloutBuffer,
+    evaluate_components,
+)
 from sb3_gcr.schedules import adapt_learning_rate
 from tests.envs import SPEC, BatchedEnv, Env, Terms
 
@@ -54,7 +66,10 @@ def learned(model: Any, timesteps: int = 128) -> Any:
         {},
         {"clip_range_vf": 0.1, "ent_coef": 0.01, "target_kl": 0.01},
         {"use_sde": True, "sde_sample_freq": 4},
-        {"policy_kwargs": {"share_features_extractor": False, "net_arch": [8]}, "normalize_advantage": False},
+        {
+            "policy_kwargs": {"share_features_extractor": False, "net_arch": [8]},
+            "normalize_advantage": False,
+        },
         {"batch_size": 13},
     ],
 )
@@ -63,7 +78,9 @@ def test_one_objective_is_sb3s_ppo_bit_for_bit(kwargs: Any) -> None:
     for spec in (None, RewardSpec(("only",), (0,))):
         models = []
         for algorithm in (PPO, GCRPPO):
-            env = make_vec_env(lambda spec=spec: Env(spec or RewardSpec(("only",), (0,))), n_envs=2, seed=0)
+            env = make_vec_env(
+                lambda spec=spec: Env(spec or RewardSpec(("only",), (0,))), n_envs=2, seed=0
+            )
             models.append(algorithm("MlpPolicy", env, **{**SMALL, **kwargs}).learn(256))
         assert th.equal(parameters(models[0]), parameters(models[1]))
         assert models[0].predict(np.ones(4), deterministic=True)[0].tolist() == (
@@ -73,32 +90,49 @@ def test_one_objective_is_sb3s_ppo_bit_for_bit(kwargs: Any) -> None:
 
 @pytest.mark.parametrize("method", ["one_backward", "passes"])
 def test_sum_with_minibatch_scope_takes_ppos_first_step(method: str) -> None:
-    """The first minibatch's actor gradient is PPO's on the summed reward, if the critics agree: V = Σ V^(k)."""
+    """The first minibatch's actor gradient is PPO's on the summed reward, if the critics agree: V =
+    Σ V^(k).
+    """
     gradients = []
     for algorithm, kwargs in (
         (PPO, {}),
         (GCRPPO, {"resolver": "sum", "advantage_scope": "minibatch", "gramian_method": method}),
     ):
         env = DummyVecEnv([Env])
-        model = algorithm("MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, seed=0, max_grad_norm=1e9, **kwargs)
+        model = algorithm(
+            "MlpPolicy",
+            env,
+            n_steps=32,
+            batch_size=32,
+            n_epochs=1,
+            seed=0,
+            max_grad_norm=1e9,
+            **kwargs,
+        )
         with th.no_grad():
             model.policy.value_net.weight.zero_()
             model.policy.value_net.bias.zero_()
         th.manual_seed(0)  # the wider head drew more numbers
         model.learn(32)
-        actor = [p.grad.flatten() for name, p in model.policy.named_parameters() if "value" not in name]
+        actor = [
+            p.grad.flatten() for name, p in model.policy.named_parameters() if "value" not in name
+        ]
         gradients.append(th.cat(actor))
     th.testing.assert_close(gradients[1], gradients[0], rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"clip_range_vf": 0.2, "ent_coef": 0.02}, {"target_kl": 0.02}])
+@pytest.mark.parametrize(
+    "kwargs", [{}, {"clip_range_vf": 0.2, "ent_coef": 0.02}, {"target_kl": 0.02}]
+)
 def test_all_ways_to_the_gramian_train_alike(kwargs: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """One backward pass in NumPy and in PyTorch, and K of them."""
     models = []
     for method, limit in (("passes", 0), ("one_backward", 2**25), ("one_backward", 0)):
         for name in ("SMALL", "SMALL_FOR_THREADS"):
-            monkeypatch.setattr(f"sb3_gcr.one_backward.{name}", limit)
-        model = GCRPPO("MlpPolicy", make_vec_env(Env, 2, seed=0), gramian_method=method, **SMALL, **kwargs).learn(128)
+            monkeypatch.setattr(f"sb3_gcr.gradients.by_hand.{name}", limit)
+        model = GCRPPO(
+            "MlpPolicy", make_vec_env(Env, 2, seed=0), gramian_method=method, **SMALL, **kwargs
+        ).learn(128)
         models.append(model)
         assert getattr(model._networks, "in_numpy", False) is (limit > 0)
     for model in models[1:]:
@@ -106,11 +140,17 @@ def test_all_ways_to_the_gramian_train_alike(kwargs: Any, monkeypatch: pytest.Mo
 
 
 def test_general_path_with_one_objective_is_ppo_to_rounding() -> None:
-    """``desired_kl`` makes our own loop run with K = 1; with a target that the KL never leaves it takes PPO's steps."""
+    """``desired_kl`` makes our own loop run with K = 1; with a target that the KL never leaves it
+    takes PPO's steps.
+    """
     models = []
     for algorithm, kwargs in ((PPO, {}), (GCRPPO, {"desired_kl": 1e-3})):
         env = make_vec_env(lambda: Env(None), n_envs=2, seed=0)
-        models.append(algorithm("MlpPolicy", env, n_steps=32, batch_size=64, n_epochs=1, seed=0, **kwargs).learn(64))
+        models.append(
+            algorithm(
+                "MlpPolicy", env, n_steps=32, batch_size=64, n_epochs=1, seed=0, **kwargs
+            ).learn(64)
+        )
     th.testing.assert_close(parameters(models[0]), parameters(models[1]), rtol=1e-5, atol=1e-7)
 
 
@@ -119,16 +159,32 @@ def test_general_path_with_one_objective_is_ppo_to_rounding() -> None:
 def test_logged_figures_are_ppos(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Our own loop with one component, uneven minibatches and clipping logs what SB3's PPO logs."""
     monkeypatch.setattr(GCRPPO, "_is_plain_ppo", False)
-    settings: dict[str, Any] = {"n_steps": 32, "batch_size": 24, "n_epochs": 3, "seed": 0, "learning_rate": 0.01}
+    settings: dict[str, Any] = {
+        "n_steps": 32,
+        "batch_size": 24,
+        "n_epochs": 3,
+        "seed": 0,
+        "learning_rate": 0.01,
+    }
     logs = []
     for algorithm, kwargs in ((PPO, {}), (GCRPPO, {"gramian_method": method})):
         env = make_vec_env(lambda: Env(None), n_envs=2, seed=0)
-        model = algorithm("MlpPolicy", env, ent_coef=0.01, clip_range_vf=0.05, **settings, **kwargs).learn(64)
+        model = algorithm(
+            "MlpPolicy", env, ent_coef=0.01, clip_range_vf=0.05, **settings, **kwargs
+        ).learn(64)
         logs.append(model.logger.name_to_value)
     keys = [key for key in logs[0] if key.startswith("train/")]
     assert logs[0]["train/clip_fraction"] > 0
-    assert {"train/approx_kl", "train/loss", "train/value_loss", "train/policy_gradient_loss", "train/entropy_loss"} <= {*keys}
-    assert {key: logs[1][key] for key in keys} == pytest.approx({key: logs[0][key] for key in keys}, rel=1e-3, abs=1e-5)
+    assert {
+        "train/approx_kl",
+        "train/loss",
+        "train/value_loss",
+        "train/policy_gradient_loss",
+        "train/entropy_loss",
+    } <= {*keys}
+    assert {key: logs[1][key] for key in keys} == pytest.approx(
+        {key: logs[0][key] for key in keys}, rel=1e-3, abs=1e-5
+    )
 
 
 # ------------------------------------------------- envs, policies, action spaces
@@ -137,11 +193,17 @@ def test_logged_figures_are_ppos(method: str, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize("action", ["Box", "Discrete", "MultiDiscrete", "MultiBinary"])
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_action_spaces(action: str, n_envs: int) -> None:
-    model = learned(GCRPPO("MlpPolicy", make_vec_env(lambda: Env(action=action), n_envs), ent_coef=0.01, **SMALL))
+    model = learned(
+        GCRPPO(
+            "MlpPolicy", make_vec_env(lambda: Env(action=action), n_envs), ent_coef=0.01, **SMALL
+        )
+    )
     assert model.predict(np.zeros(4, np.float32))[0].shape == model.action_space.shape
 
 
-@pytest.mark.parametrize("observation", ["Discrete", "MultiDiscrete", "Image", "ImageChannelsLast", "Dict", "DictImage"])
+@pytest.mark.parametrize(
+    "observation", ["Discrete", "MultiDiscrete", "Image", "ImageChannelsLast", "Dict", "DictImage"]
+)
 @pytest.mark.parametrize("share", [True, False])
 def test_observation_spaces(observation: str, share: bool) -> None:
     policy = {"Image": "CnnPolicy", "ImageChannelsLast": "CnnPolicy"}.get(observation, "MlpPolicy")
@@ -155,10 +217,21 @@ def test_observation_spaces(observation: str, share: bool) -> None:
 
 @pytest.mark.parametrize("sde_sample_freq", [-1, 4])
 def test_gsde(sde_sample_freq: int) -> None:
-    model = GCRPPO("MlpPolicy", make_vec_env(Env, 2), use_sde=True, sde_sample_freq=sde_sample_freq, **SMALL)
+    model = GCRPPO(
+        "MlpPolicy", make_vec_env(Env, 2), use_sde=True, sde_sample_freq=sde_sample_freq, **SMALL
+    )
     learned(model)
     squashed = {"squash_output": True}
-    learned(GCRPPO("MlpPolicy", make_vec_env(Env, 2), use_sde=True, ent_coef=0.01, policy_kwargs=squashed, **SMALL))
+    learned(
+        GCRPPO(
+            "MlpPolicy",
+            make_vec_env(Env, 2),
+            use_sde=True,
+            ent_coef=0.01,
+            policy_kwargs=squashed,
+            **SMALL,
+        )
+    )
 
 
 class Noisy(BaseFeaturesExtractor):
@@ -189,7 +262,14 @@ def test_batch_norm_and_dropout_train_and_predict_in_their_modes(share: bool) ->
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 def test_minibatches_that_do_not_divide_the_rollout(batch_size: int, scope: str) -> None:
     """64 samples: a last minibatch of 2, of 1, none, and a minibatch larger than the rollout."""
-    model = GCRPPO("MlpPolicy", make_vec_env(Env, 2), n_steps=32, batch_size=batch_size, advantage_scope=scope, n_epochs=2)
+    model = GCRPPO(
+        "MlpPolicy",
+        make_vec_env(Env, 2),
+        n_steps=32,
+        batch_size=batch_size,
+        advantage_scope=scope,
+        n_epochs=2,
+    )
     learned(model)
 
 
@@ -226,20 +306,34 @@ def test_every_resolver_and_a_users_own() -> None:
 
     for resolver in RESOLVERS:
         learned(GCRPPO("MlpPolicy", make_vec_env(Env, 2), resolver=resolver, **SMALL))
-    model = learned(GCRPPO("MlpPolicy", make_vec_env(Env, 2), resolver=mine, resolver_kwargs={"factor": 2.0}, **SMALL))
+    model = learned(
+        GCRPPO(
+            "MlpPolicy",
+            make_vec_env(Env, 2),
+            resolver=mine,
+            resolver_kwargs={"factor": 2.0},
+            **SMALL,
+        )
+    )
     assert model.logger.name_to_value["gcr/weight/go"] == 2
 
 
 def test_the_signature_begins_with_ppos() -> None:
     theirs = list(inspect.signature(PPO.__init__).parameters.values())
     ours = list(inspect.signature(GCRPPO.__init__).parameters.values())
-    assert [(p.name, p.default) for p in ours[: len(theirs)]] == [(p.name, p.default) for p in theirs]
+    assert [(p.name, p.default) for p in ours[: len(theirs)]] == [
+        (p.name, p.default) for p in theirs
+    ]
     assert all(p.default is not inspect.Parameter.empty for p in ours[len(theirs) :])
 
 
 @pytest.mark.parametrize(
     ("kwargs", "scale"),
-    [({"normalize_advantage": False}, "none"), ({"advantage_scope": "minibatch"}, "minibatch"), ({}, "rollout")],
+    [
+        ({"normalize_advantage": False}, "none"),
+        ({"advantage_scope": "minibatch"}, "minibatch"),
+        ({}, "rollout"),
+    ],
 )
 def test_scope_of_the_normalisation(kwargs: Any, scale: str) -> None:
     model = GCRPPO("MlpPolicy", make_vec_env(Env, 2, seed=0), **SMALL, **kwargs).learn(64)
@@ -271,7 +365,12 @@ class Recorder(BaseCallback):
         self.steps: list[dict[str, Any]] = []
 
     def _on_step(self) -> bool:
-        self.steps.append({key: self.locals[key] for key in ("rewards", "values", "dones", "infos", "reward_components")})
+        self.steps.append(
+            {
+                key: self.locals[key]
+                for key in ("rewards", "values", "dones", "infos", "reward_components")
+            }
+        )
         return True
 
 
@@ -282,11 +381,15 @@ def test_callbacks_see_scalar_rewards_and_vector_values() -> None:
     for step in recorder.steps:
         assert step["rewards"].shape == (2,)
         assert step["values"].shape == (2, 3)
-        np.testing.assert_allclose(step["reward_components"].sum(1), step["rewards"], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(
+            step["reward_components"].sum(1), step["rewards"], rtol=1e-5, atol=1e-5
+        )
 
 
 def test_time_limits_bootstrap_every_head_in_one_forward_pass() -> None:
-    """All episodes end by the time limit at the same step; the stored components carry γ V^(k) of the terminal observation."""
+    """All episodes end by the time limit at the same step; the stored components carry γ V^(k) of
+    the terminal observation.
+    """
     env = make_vec_env(lambda: Env(limit=8, p_end=0.0), 3, seed=0)
     model = GCRPPO("MlpPolicy", env, gamma=0.9, n_steps=8, batch_size=8, n_epochs=1, seed=0)
     calls: list[int] = []
@@ -307,12 +410,18 @@ def test_time_limits_bootstrap_every_head_in_one_forward_pass() -> None:
     terminal = np.stack([info["terminal_observation"] for info in last["infos"]])
     with th.no_grad():
         values = original(th.as_tensor(terminal)).numpy()
-    np.testing.assert_allclose(model.rollout_buffer.rewards[7], last["reward_components"] + 0.9 * values, rtol=1e-5)
-    np.testing.assert_allclose(model.rollout_buffer.rewards[3], recorder.steps[3]["reward_components"], rtol=1e-6)
+    np.testing.assert_allclose(
+        model.rollout_buffer.rewards[7], last["reward_components"] + 0.9 * values, rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        model.rollout_buffer.rewards[3], recorder.steps[3]["reward_components"], rtol=1e-6
+    )
 
 
 def test_rollout_matches_sb3s_on_the_summed_reward() -> None:
-    """Same actions, observations and log-probabilities as PPO; the components sum to its rewards."""
+    """Same actions, observations and log-probabilities as PPO; the components sum to its
+    rewards.
+    """
     buffers = []
     for algorithm in (PPO, GCRPPO):
         env = make_vec_env(lambda: Env(p_end=0.2, limit=1000), 2, seed=0)
@@ -327,7 +436,9 @@ def test_rollout_matches_sb3s_on_the_summed_reward() -> None:
         np.testing.assert_array_equal(getattr(buffers[0], name), getattr(buffers[1], name))
     for name in ("rewards", "advantages", "returns"):
         assert getattr(buffers[1], name).shape == (32, 2, 3)
-        np.testing.assert_allclose(getattr(buffers[1], name).sum(-1), getattr(buffers[0], name), rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(
+            getattr(buffers[1], name).sum(-1), getattr(buffers[0], name), rtol=1e-4, atol=1e-4
+        )
 
 
 # ------------------------------------------------------- SB3's tools around it
@@ -336,7 +447,9 @@ def test_rollout_matches_sb3s_on_the_summed_reward() -> None:
 def test_callbacks_evaluation_and_checkpoints(tmp_path: Path) -> None:
     eval_env = make_vec_env(Env, 1)
     callbacks = [
-        EvalCallback(eval_env, eval_freq=32, n_eval_episodes=2, best_model_save_path=str(tmp_path), verbose=0),
+        EvalCallback(
+            eval_env, eval_freq=32, n_eval_episodes=2, best_model_save_path=str(tmp_path), verbose=0
+        ),
         CheckpointCallback(32, str(tmp_path / "checkpoints")),
     ]
     model = GCRPPO("MlpPolicy", make_vec_env(Env, 1), **SMALL)
@@ -360,7 +473,9 @@ def test_component_returns_after_a_callback_stopped_at_the_end_of_an_episode() -
     model.learn(64, callback=StopTrainingOnMaxEpisodes(1))
     model.learn(64, reset_num_timesteps=False)
     returns = [episode["r"] for episode in model.ep_info_buffer]
-    np.testing.assert_allclose(np.sum(model.ep_component_buffer, axis=1)[-len(returns) :], returns, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        np.sum(model.ep_component_buffer, axis=1)[-len(returns) :], returns, rtol=1e-4, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("action", ["Box", "Discrete"])
@@ -400,11 +515,20 @@ def test_logged_keys(tmp_path: Path) -> None:
     theirs = set(pd.read_csv(tmp_path / "ppo" / "progress.csv").columns)
     assert set(progress.columns) == ours | theirs
     last = progress.iloc[-1]
-    assert last["train/value_loss"] == pytest.approx(sum(last[f"train/value_loss/{name}"] for name in names), rel=1e-5)
-    assert last["rollout/ep_rew_mean"] == pytest.approx(sum(last[f"rollout/ep_rew/{name}"] for name in names), rel=1e-4)
+    assert last["train/value_loss"] == pytest.approx(
+        sum(last[f"train/value_loss/{name}"] for name in names), rel=1e-5
+    )
+    assert last["rollout/ep_rew_mean"] == pytest.approx(
+        sum(last[f"rollout/ep_rew/{name}"] for name in names), rel=1e-4
+    )
     assert 0 <= last["gcr/conflict_rate"] <= 1
     cosines = pd.read_csv(tmp_path / "cosines.csv")
-    assert list(cosines.columns) == ["time/total_timesteps", "go | stay", "go | save", "stay | save"]
+    assert list(cosines.columns) == [
+        "time/total_timesteps",
+        "go | stay",
+        "go | save",
+        "stay | save",
+    ]
     assert cosines["time/total_timesteps"].tolist() == [64, 128, 192]
     assert (cosines.iloc[:, 1:].abs() <= 1).all(axis=None)
     text = (tmp_path / "log.txt").read_text()
@@ -421,14 +545,21 @@ def test_logged_keys(tmp_path: Path) -> None:
 def test_statistics_are_means_over_all_minibatches() -> None:
     """A resolver that returns 1, 2, 3, … makes the mean of the weights known."""
     calls = iter(range(1, 100))
-    model = GCRPPO("MlpPolicy", make_vec_env(Env, 1), resolver=lambda g, levels, rng: np.full(3, next(calls)), **SMALL)
+    model = GCRPPO(
+        "MlpPolicy",
+        make_vec_env(Env, 1),
+        resolver=lambda g, levels, rng: np.full(3, next(calls)),
+        **SMALL,
+    )
     model.learn(32)
     # one call when learning starts, then 2 epochs of 2 minibatches: 2, 3, 4, 5
     assert model.logger.name_to_value["gcr/weight/go"] == 3.5
 
 
 def test_names_that_look_alike_do_not_break_the_table() -> None:
-    spec = RewardSpec(tuple(f"a_very_long_name_that_is_cut_in_the_table_{i}" for i in range(3)), (0, 0, 1))
+    spec = RewardSpec(
+        tuple(f"a_very_long_name_that_is_cut_in_the_table_{i}" for i in range(3)), (0, 0, 1)
+    )
     GCRPPO("MlpPolicy", make_vec_env(lambda: Env(spec), 1), verbose=1, **SMALL).learn(64)
 
 
@@ -439,11 +570,16 @@ def test_evaluate_components() -> None:
     assert list(result.component_means) == list(SPEC.names)
     assert sum(result.component_means.values()) == pytest.approx(result.mean_reward, rel=1e-5)
     rewards, lengths, components = evaluate_components(model, env, 7, return_episode_rewards=True)
-    np.testing.assert_allclose(np.sum(list(components.values()), axis=0), rewards, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        np.sum(list(components.values()), axis=0), rewards, rtol=1e-4, atol=1e-4
+    )
     assert len(lengths) == 7
     batched = evaluate_components(model, BatchedEnvWithInfos(), 3, warn=False)
     assert np.isfinite(list(batched.component_means.values())).all()
-    message = "Parameter `env` must report reward components, found none. Wrap it with `RewardDecomposition`."
+    message = (
+        "Parameter `env` must report reward components, found none. Wrap it with "
+        "`RewardDecomposition`."
+    )
     with pytest.raises(ValueError, match=exactly(message)):
         evaluate_components(model, make_vec_env(lambda: Env(None), 1), 1)
 
@@ -467,11 +603,25 @@ def test_adaptive_learning_rate_rule() -> None:
 
 def test_adaptive_learning_rate_takes_over_after_the_first_minibatch() -> None:
     model = GCRPPO(
-        "MlpPolicy", make_vec_env(Env, 1), desired_kl=1e6, learning_rate=1e-4, n_steps=32, batch_size=32, n_epochs=1
+        "MlpPolicy",
+        make_vec_env(Env, 1),
+        desired_kl=1e6,
+        learning_rate=1e-4,
+        n_steps=32,
+        batch_size=32,
+        n_epochs=1,
     )
     model.learn(32)
     assert model.policy.optimizer.param_groups[0]["lr"] == 1e-4
-    model = GCRPPO("MlpPolicy", make_vec_env(Env, 1), desired_kl=1e6, learning_rate=1e-4, n_steps=32, batch_size=8, n_epochs=1)
+    model = GCRPPO(
+        "MlpPolicy",
+        make_vec_env(Env, 1),
+        desired_kl=1e6,
+        learning_rate=1e-4,
+        n_steps=32,
+        batch_size=8,
+        n_epochs=1,
+    )
     model.learn(32)
     assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4 * 1.5**3)
     model.learn(32, reset_num_timesteps=False)
@@ -488,19 +638,22 @@ def test_adaptive_learning_rate_takes_over_after_the_first_minibatch() -> None:
         (
             {"resolver": "pcgrad"},
             ValueError,
-            "Parameter `resolver` must be one of ['gcr', 'gcr_authors', 'guaranteed', 'no_priority', 'sum'] or a callable "
+            "Parameter `resolver` must be one of ['gcr', 'gcr_authors', 'guaranteed', "
+            "'no_priority', 'sum'] or a callable "
             "(gramian, levels, rng) -> weights, found 'pcgrad'.",
         ),
         (
             {"resolver": 3},
             TypeError,
-            "Parameter `resolver` must be one of ['gcr', 'gcr_authors', 'guaranteed', 'no_priority', 'sum'] or a callable "
+            "Parameter `resolver` must be one of ['gcr', 'gcr_authors', 'guaranteed', "
+            "'no_priority', 'sum'] or a callable "
             "(gramian, levels, rng) -> weights, found 3.",
         ),
         (
             {"resolver_kwargs": {"colour": 1}},
             TypeError,
-            "Parameter `resolver_kwargs` must fit the resolver's signature (gramian, levels, rng, ...), "
+            "Parameter `resolver_kwargs` must fit the resolver's signature (gramian, levels, rng, "
+            "...), "
             "found {'colour': 1}: got an unexpected keyword argument 'colour'.",
         ),
         (
@@ -509,7 +662,11 @@ def test_adaptive_learning_rate_takes_over_after_the_first_minibatch() -> None:
             "Parameter `advantage_scope` must be 'rollout', 'minibatch' or None, found 'batch'.",
         ),
         ({"kappa_max": 0}, ValueError, "Parameter `kappa_max` must be a number > 0, found 0."),
-        ({"desired_kl": -1.0}, ValueError, "Parameter `desired_kl` must be a number > 0 or None, found -1.0."),
+        (
+            {"desired_kl": -1.0},
+            ValueError,
+            "Parameter `desired_kl` must be a number > 0 or None, found -1.0.",
+        ),
         (
             {"gramian_method": "two"},
             ValueError,
@@ -526,7 +683,8 @@ def test_adaptive_learning_rate_takes_over_after_the_first_minibatch() -> None:
         (
             {"rollout_buffer_class": __import__("stable_baselines3").common.buffers.RolloutBuffer},
             ValueError,
-            "Parameter `rollout_buffer_class` must be a subclass of VectorRolloutBuffer for more than one reward component, "
+            "Parameter `rollout_buffer_class` must be a subclass of VectorRolloutBuffer for more "
+            "than one reward component, "
             "found RolloutBuffer.",
         ),
     ],
@@ -540,7 +698,8 @@ def test_wrong_policy_classes() -> None:
     from stable_baselines3.common.policies import ActorCriticPolicy
 
     choices = (
-        "Parameter `policy` must be one of ['CnnPolicy', 'MlpPolicy', 'MultiInputPolicy'] or a subclass of "
+        "Parameter `policy` must be one of ['CnnPolicy', 'MlpPolicy', 'MultiInputPolicy'] or a "
+        "subclass of "
         "MultiHeadActorCriticPolicy, found {}. Recurrent and maskable policies are not supported."
     )
     with pytest.raises(ValueError, match=exactly(choices.format("'MlpLstmPolicy'"))):
@@ -548,7 +707,9 @@ def test_wrong_policy_classes() -> None:
     with pytest.raises(ValueError, match=exactly(choices.format("'ActorCriticPolicy'"))):
         GCRPPO(ActorCriticPolicy, make_vec_env(Env, 1))
     recurrent = type(
-        "RecurrentActorCriticPolicy", (ActorCriticPolicy,), {"__module__": "sb3_contrib.common.recurrent.policies"}
+        "RecurrentActorCriticPolicy",
+        (ActorCriticPolicy,),
+        {"__module__": "sb3_contrib.common.recurrent.policies"},
     )
     with pytest.raises(ValueError, match=exactly(choices.format("'RecurrentActorCriticPolicy'"))):
         GCRPPO(recurrent, make_vec_env(lambda: Env(None), 1))
@@ -559,22 +720,34 @@ def test_wrong_policy_classes() -> None:
     ("weights", "message"),
     [
         (np.ones(2), "Parameter `resolver` must return weights of shape (3,), found shape (2,)."),
-        (np.ones((3, 1)), "Parameter `resolver` must return weights of shape (3,), found shape (3, 1)."),
-        (np.full(3, np.nan), "Parameter `resolver` must return finite weights, found [nan nan nan]."),
+        (
+            np.ones((3, 1)),
+            "Parameter `resolver` must return weights of shape (3,), found shape (3, 1).",
+        ),
+        (
+            np.full(3, np.nan),
+            "Parameter `resolver` must return finite weights, found [nan nan nan].",
+        ),
     ],
 )
 def test_wrong_weights_fail_before_the_first_rollout(weights: Any, message: str) -> None:
-    model = GCRPPO("MlpPolicy", make_vec_env(Env, 1), resolver=lambda gramian, levels, rng: weights, **SMALL)
+    model = GCRPPO(
+        "MlpPolicy", make_vec_env(Env, 1), resolver=lambda gramian, levels, rng: weights, **SMALL
+    )
     with pytest.raises(ValueError, match=exactly(message)):
         model.learn(64)
     assert model.num_timesteps == 0
 
 
 def test_one_backward_cannot_be_forced_on_a_network_that_does_not_fit() -> None:
-    model = GCRPPO("MlpPolicy", make_vec_env(Env, 1), use_sde=True, gramian_method="one_backward", **SMALL)
+    model = GCRPPO(
+        "MlpPolicy", make_vec_env(Env, 1), use_sde=True, gramian_method="one_backward", **SMALL
+    )
     message = (
-        "Parameter `gramian_method` must be 'auto' or 'passes' for this policy, found 'one_backward', which needs an "
-        "actor and a critic of linear layers and common activations, a flat features extractor and no gSDE."
+        "Parameter `gramian_method` must be 'auto' or 'passes' for this policy, found "
+        "'one_backward', which needs an "
+        "actor and a critic of linear layers and common activations, a flat features extractor and "
+        "no gSDE."
     )
     with pytest.raises(ValueError, match=exactly(message)):
         model.learn(32)
@@ -598,29 +771,43 @@ class Failing(gym.Wrapper[Any, Any, Any, Any]):
 FAULTS = {
     "missing": (
         lambda info: info.pop("b"),
-        "Reward component 'b' is missing: parameter `components` must name keys of `info`, found only ['a'].",
+        "Reward component 'b' is missing: parameter `components` must name keys of `info`, found "
+        "only ['a'].",
     ),
-    "nan": (lambda info: info.update(a=np.nan), "Reward component 'a' must be finite, found nan (a=nan, b=2)."),
-    "infinite": (lambda info: info.update(b=np.inf), "Reward component 'b' must be finite, found inf (a=1, b=inf)."),
+    "nan": (
+        lambda info: info.update(a=np.nan),
+        "Reward component 'a' must be finite, found nan (a=nan, b=2).",
+    ),
+    "infinite": (
+        lambda info: info.update(b=np.inf),
+        "Reward component 'b' must be finite, found inf (a=1, b=inf).",
+    ),
     "sum": (
         lambda info: info.update(b=5.0),
-        "The reward components must sum to the reward 3, found 6 (a=1, b=5). Name the missing terms, or collect the rest in "
+        "The reward components must sum to the reward 3, found 6 (a=1, b=5). Name the missing "
+        "terms, or collect the rest in "
         'a component of its own with `RewardDecomposition(residual="name")`.',
     ),
 }
 
 
 def broken_env(fault: str, step: int) -> gym.Env[Any, Any]:
-    return RewardDecomposition(Failing(Terms([{"a": 1.0, "b": 2.0}], [3.0]), step, FAULTS[fault][0]), {"a": 0, "b": 1})
+    return RewardDecomposition(
+        Failing(Terms([{"a": 1.0, "b": 2.0}], [3.0]), step, FAULTS[fault][0]), {"a": 0, "b": 1}
+    )
 
 
 @pytest.mark.parametrize("fault", list(FAULTS))
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
-def test_faults_in_the_middle_of_a_run_name_env_and_timestep(fault: str, vec_env_cls: Any, tmp_path: Path) -> None:
+def test_faults_in_the_middle_of_a_run_name_env_and_timestep(
+    fault: str, vec_env_cls: Any, tmp_path: Path
+) -> None:
     env = vec_env_cls([lambda: broken_env(fault, 10**9), lambda: broken_env(fault, 40)])
     model = GCRPPO("MlpPolicy", env, **SMALL)
     checkpoint = CheckpointCallback(16, str(tmp_path))
-    with pytest.raises(ValueError, match=exactly(f"Env index 1 at timestep 80: {FAULTS[fault][1]}")):
+    with pytest.raises(
+        ValueError, match=exactly(f"Env index 1 at timestep 80: {FAULTS[fault][1]}")
+    ):
         model.learn(256, callback=checkpoint)
     env.close()
     saved = GCRPPO.load(max(tmp_path.glob("*.zip"), key=lambda path: path.stat().st_mtime))
@@ -646,7 +833,8 @@ def test_nan_in_training_raises_before_it_reaches_the_weights(method: str) -> No
     before = parameters(model).clone()
     model.rollout_buffer._tensors["returns"][:, 1] = np.nan
     message = (
-        "The value loss must be finite, found nan in the update at timestep 32. The weights are those of the last good step; "
+        "The value loss must be finite, found nan in the update at timestep 32. The weights are "
+        "those of the last good step; "
         "a smaller `learning_rate`, or scaled returns (VecNormalize), may help."
     )
     with pytest.raises(ValueError, match=exactly(message)):
@@ -667,7 +855,8 @@ def test_nan_observations_raise_before_the_update(spec: Any) -> None:
     before = parameters(model).clone()
     model.rollout_buffer.advantages[3] = np.nan
     message = (
-        "The rollout's `advantages` must be finite, found NaN or infinity before the update at timestep 32. The policy is as "
+        "The rollout's `advantages` must be finite, found NaN or infinity before the update at "
+        "timestep 32. The policy is as "
         "it was; check rewards and observations, e.g. with VecCheckNan."
     )
     with pytest.raises(ValueError, match=exactly(message)):
@@ -678,7 +867,8 @@ def test_nan_observations_raise_before_the_update(spec: Any) -> None:
 def test_env_ids_of_the_table_are_taken_apart_and_others_are_not() -> None:
     model = GCRPPO("MlpPolicy", "Humanoid-v5", **SMALL)
     assert str(model.reward_spec) == (
-        "reward_forward (task), reward_survive (task), reward_ctrl (regulariser), reward_contact (regulariser)"
+        "reward_forward (task), reward_survive (task), reward_ctrl (regulariser), reward_contact "
+        "(regulariser)"
     )
     learned(model, 32)
     assert isinstance(model.rollout_buffer, VectorRolloutBuffer)
@@ -687,8 +877,10 @@ def test_env_ids_of_the_table_are_taken_apart_and_others_are_not() -> None:
 
 def test_an_undecomposed_env_of_the_table_warns_with_the_line_to_add() -> None:
     message = (
-        "'HalfCheetah-v5' reports the terms of its reward, but nothing collects them, so GCRPPO trains one objective. "
-        "Add the line `env = RewardDecomposition(env)`, or `make_vec_env(..., wrapper_class=RewardDecomposition)`."
+        "'HalfCheetah-v5' reports the terms of its reward, but nothing collects them, so GCRPPO "
+        "trains one objective. "
+        "Add the line `env = RewardDecomposition(env)`, or `make_vec_env(..., "
+        "wrapper_class=RewardDecomposition)`."
     )
     with pytest.warns(UserWarning, match=exactly(message)):
         model = GCRPPO("MlpPolicy", gym.make("HalfCheetah-v5"))
@@ -699,7 +891,9 @@ def test_an_undecomposed_env_of_the_table_warns_with_the_line_to_add() -> None:
 
 def test_verbose_says_what_runs(capsys: pytest.CaptureFixture[str]) -> None:
     GCRPPO("MlpPolicy", make_vec_env(lambda: Env(None), 1), verbose=1, **SMALL).learn(32)
-    assert "One reward component: training is SB3's PPO with one objective." in capsys.readouterr().out
+    assert (
+        "One reward component: training is SB3's PPO with one objective." in capsys.readouterr().out
+    )
     GCRPPO("MlpPolicy", make_vec_env(Env, 1), verbose=1, **SMALL).learn(32)
     out = capsys.readouterr().out
     assert "3 reward components: go (task), stay (task), save (regulariser)" in out

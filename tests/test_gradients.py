@@ -12,16 +12,12 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from threadpoolctl import threadpool_info, threadpool_limits
 from torch import nn
 
-from sb3_gcr import one_backward
-from sb3_gcr.gradients import (
-    ManyBackwards,
-    gramian_by_passes,
-    surrogate_cotangents,
-    surrogate_losses,
-    value_cotangents,
-    value_errors,
-)
-from sb3_gcr.one_backward import ACTIVATIONS, OneBackward, layer_gramian
+from sb3_gcr.gradients import by_hand
+from sb3_gcr.gradients.by_autograd import ManyBackwards, gramian_by_passes
+from sb3_gcr.gradients.by_hand import OneBackward
+from sb3_gcr.gradients.gramian import layer_gramian
+from sb3_gcr.gradients.layers import ACTIVATIONS
+from sb3_gcr.losses import surrogate_cotangents, surrogate_losses, value_cotangents, value_errors
 from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from tests.envs import ACTIONS, OBSERVATIONS
 
@@ -31,7 +27,8 @@ B, K = 24, 5
 @pytest.mark.parametrize(
     ("ratio", "advantage", "loss", "slope"),
     [
-        # inside the range: -ρ A; outside: -clip(ρ) A without slope only where clipping makes it larger
+        # inside the range: -ρ A; outside: -clip(ρ) A without slope only where clipping makes it
+        # larger
         (1.0, 2.0, -2.0, -2.0),
         (1.1, 2.0, -2.2, -2.2),
         (1.5, 2.0, -2.4, 0.0),
@@ -45,7 +42,9 @@ def test_surrogate_by_hand(ratio: float, advantage: float, loss: float, slope: f
     log_prob, old = th.tensor([np.log(ratio)]), th.zeros(1)
     advantages = th.tensor([[advantage]], dtype=th.double)
     assert surrogate_losses(log_prob, old, advantages, 0.2).item() == pytest.approx(loss)
-    assert surrogate_cotangents(log_prob.detach(), old, advantages, 0.2).item() == pytest.approx(slope)
+    assert surrogate_cotangents(log_prob.detach(), old, advantages, 0.2).item() == pytest.approx(
+        slope
+    )
 
 
 def test_cotangents_are_the_derivative_of_the_surrogates() -> None:
@@ -55,7 +54,9 @@ def test_cotangents_are_the_derivative_of_the_surrogates() -> None:
     losses = surrogate_losses(log_prob, old, advantages, 0.2).mean(0)
     for k in range(K):
         (expected,) = th.autograd.grad(losses[k], log_prob, retain_graph=True)
-        th.testing.assert_close(surrogate_cotangents(log_prob.detach(), old, advantages, 0.2)[:, k], expected)
+        th.testing.assert_close(
+            surrogate_cotangents(log_prob.detach(), old, advantages, 0.2)[:, k], expected
+        )
 
 
 def test_nan_is_not_clipped_away() -> None:
@@ -77,7 +78,11 @@ def test_value_errors_against_autograd(clip_range_vf: float | None) -> None:
     th.manual_seed(0)
     values = th.randn(B, K, requires_grad=True)
     old, returns = values.detach() + 0.4 * th.randn(B, K), th.randn(B, K)
-    predicted = values if clip_range_vf is None else old + (values - old).clamp(-clip_range_vf, clip_range_vf)
+    predicted = (
+        values
+        if clip_range_vf is None
+        else old + (values - old).clamp(-clip_range_vf, clip_range_vf)
+    )
     expected = ((predicted - returns) ** 2).mean(0)
     arguments = (values.detach(), old, returns, clip_range_vf)
     cotangents = value_cotangents(*arguments)
@@ -87,7 +92,10 @@ def test_value_errors_against_autograd(clip_range_vf: float | None) -> None:
 
 def test_gramian_by_passes_is_a_naive_double_loop() -> None:
     th.manual_seed(0)
-    net, unused = nn.Sequential(nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 1)), nn.Parameter(th.ones(2))
+    net, unused = (
+        nn.Sequential(nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 1)),
+        nn.Parameter(th.ones(2)),
+    )
     x, cotangents = th.randn(B, 3), th.randn(B, K)
     parameters = [*net.parameters(), unused]
     jacobian = []
@@ -95,7 +103,9 @@ def test_gramian_by_passes_is_a_naive_double_loop() -> None:
         net.zero_grad()
         for b in range(B):
             (cotangents[b, k] * net(x[b : b + 1]).sum()).backward()
-        jacobian.append(th.cat([p.grad.flatten().clone() for p in net.parameters() if p.grad is not None]))
+        jacobian.append(
+            th.cat([p.grad.flatten().clone() for p in net.parameters() if p.grad is not None])
+        )
     expected = th.stack(jacobian) @ th.stack(jacobian).T
     actual = gramian_by_passes(net(x)[:, 0], cotangents, parameters)
     th.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
@@ -120,16 +130,22 @@ class OwnForward(MlpPolicy):
         return values, 0.5 * log_prob, entropy
 
 
-def make(policy_class: Any = MlpPolicy, observation: str = "Box", action: str = "Box", **kwargs: Any) -> Any:
+def make(
+    policy_class: Any = MlpPolicy, observation: str = "Box", action: str = "Box", **kwargs: Any
+) -> Any:
     th.manual_seed(0)
-    policy = policy_class(OBSERVATIONS[observation], ACTIONS[action], lambda _: 1e-3, n_objectives=K, **kwargs)
+    policy = policy_class(
+        OBSERVATIONS[observation], ACTIONS[action], lambda _: 1e-3, n_objectives=K, **kwargs
+    )
     with th.no_grad():  # SB3 starts the action head close to zero, where nothing would be tested
         policy.action_net.weight.normal_(0, 0.5)
     space = OBSERVATIONS[observation]
     space.seed(0)
     samples = [space.sample() for _ in range(B)]
     if isinstance(space, gym.spaces.Dict):
-        stacked: Any = {key: np.stack([np.asarray(sample[key]) for sample in samples]) for key in space}
+        stacked: Any = {
+            key: np.stack([np.asarray(sample[key]) for sample in samples]) for key in space
+        }
     else:
         stacked = np.stack(samples)
     return policy, policy.obs_to_tensor(stacked)[0]
@@ -165,7 +181,9 @@ OTHERS = {
 @pytest.mark.parametrize("n_samples", [None, B])
 @th.no_grad()
 def test_one_backward_is_k_backwards(name: str, ent_coef: float, n_samples: int | None) -> None:
-    """Values, log π, entropy, Gramian, the resolved gradient and its clipping, to float32 rounding, in PyTorch and NumPy."""
+    """Values, log π, entropy, Gramian, the resolved gradient and its clipping, to float32 rounding,
+    in PyTorch and NumPy.
+    """
     policy, observations = make(**FITTING[name])
     policy.set_training_mode(True)
     assert OneBackward.fits(policy)
@@ -187,17 +205,24 @@ def test_one_backward_is_k_backwards(name: str, ent_coef: float, n_samples: int 
         networks.backward(mine @ networks.array(weights), its, ent_coef)
         norm = networks.clip_gradients(0.5)
         gradients = [parameter.grad.clone() for parameter in policy.parameters()]
-        results.append([th.as_tensor(t).detach() for t in (gramian, subset, *numbers, th.tensor(norm), *gradients)])
+        results.append(
+            [
+                th.as_tensor(t).detach()
+                for t in (gramian, subset, *numbers, th.tensor(norm), *gradients)
+            ]
+        )
     assert getattr(networks, "in_numpy", None) is (n_samples is not None)
     for expected, actual in zip(*results, strict=True):
-        th.testing.assert_close(actual, expected, rtol=2e-4, atol=2e-5 * max(1.0, float(expected.abs().max())))
+        th.testing.assert_close(
+            actual, expected, rtol=2e-4, atol=2e-5 * max(1.0, float(expected.abs().max()))
+        )
 
 
 @pytest.mark.parametrize(("threads", "limit"), [(1, "SMALL"), (2, "SMALL_FOR_THREADS")])
 def test_small_updates_run_in_numpy_with_one_thread(threads: int, limit: str) -> None:
     policy, _ = make()
     n_parameters = sum(parameter.numel() for parameter in policy.parameters())
-    largest = getattr(one_backward, limit) // n_parameters
+    largest = getattr(by_hand, limit) // n_parameters
     before = th.get_num_threads()
     th.set_num_threads(threads)
     try:
@@ -208,7 +233,9 @@ def test_small_updates_run_in_numpy_with_one_thread(threads: int, limit: str) ->
     assert not large.in_numpy
 
     def blas_threads() -> list[int]:
-        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+        return [
+            library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"
+        ]
 
     with threadpool_limits(2, user_api="blas"):
         assert 2 in blas_threads()
@@ -263,10 +290,15 @@ def test_frozen_and_double_parameters_do_not_fit() -> None:
 @pytest.mark.parametrize("block", [2**10, 2**22])
 @pytest.mark.parametrize("width", [1, 7])
 def test_both_forms_of_the_gramian(
-    monkeypatch: pytest.MonkeyPatch, n_samples: int, n_objectives: int, sizes: Any, block: int, width: int
+    monkeypatch: pytest.MonkeyPatch,
+    n_samples: int,
+    n_objectives: int,
+    sizes: Any,
+    block: int,
+    width: int,
 ) -> None:
     """Small and large minibatches, in one block or many, against the Jacobian written out."""
-    monkeypatch.setattr("sb3_gcr.one_backward.BLOCK", block)
+    monkeypatch.setattr("sb3_gcr.gradients.gramian.BLOCK", block)
     th.manual_seed(0)
     cotangents = th.randn(n_samples, n_objectives, dtype=th.double)
     signals = [th.randn(n_samples, out, dtype=th.double) for _, out in sizes]
@@ -275,10 +307,19 @@ def test_both_forms_of_the_gramian(
     rows = []
     for k in range(n_objectives):
         c = cotangents[:, k]
-        parts = [th.einsum("b,bo,bi->oi", c, s, h).flatten() for s, h in zip(signals, inputs, strict=True)]
+        parts = [
+            th.einsum("b,bo,bi->oi", c, s, h).flatten()
+            for s, h in zip(signals, inputs, strict=True)
+        ]
         parts.append(c @ added)
         rows.append(th.cat(parts))
     expected = th.stack(rows) @ th.stack(rows).T
     th.testing.assert_close(layer_gramian(signals, inputs, added, cotangents), expected)
-    arrays = [signal.numpy() for signal in signals], [features.numpy() for features in inputs], added.numpy()
-    np.testing.assert_allclose(layer_gramian(*arrays, cotangents.numpy()), expected, rtol=1e-7, atol=1e-9)
+    arrays = (
+        [signal.numpy() for signal in signals],
+        [features.numpy() for features in inputs],
+        added.numpy(),
+    )
+    np.testing.assert_allclose(
+        layer_gramian(*arrays, cotangents.numpy()), expected, rtol=1e-7, atol=1e-9
+    )

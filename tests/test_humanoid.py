@@ -7,8 +7,9 @@ import pytest
 
 pytest.importorskip("mujoco.batch")
 
-from sb3_gcr.envs import geometry, humanoid, objectives
 from sb3_gcr.envs.engine import Engine
+from sb3_gcr.envs.tasks import geometry, humanoid
+from sb3_gcr.envs.tasks import ranges as objectives
 
 
 def at(*rows: float) -> np.ndarray:
@@ -29,24 +30,37 @@ def test_upright_pays_above_its_threshold_only() -> None:
 
 
 def test_move_to_target_is_linear_up_to_its_threshold() -> None:
-    np.testing.assert_allclose(humanoid.move_to_target(at(-0.8, 0, 0.4, 0.8, 0.9)), [-0.5, 0, 0.25, 0.5, 0.5])
+    np.testing.assert_allclose(
+        humanoid.move_to_target(at(-0.8, 0, 0.4, 0.8, 0.9)), [-0.5, 0, 0.25, 0.5, 0.5]
+    )
 
 
 def test_costs_grow_with_actions_and_speed() -> None:
     actions = np.array([[1.0, -1.0, 0.5], [0, 0, 0]])
     np.testing.assert_allclose(humanoid.action_l2(actions), [-0.0225, 0])
-    np.testing.assert_allclose(humanoid.energy(actions, np.array([[2.0, 4.0, -8.0], [9, 9, 9]])), [-0.05, 0])
+    np.testing.assert_allclose(
+        humanoid.energy(actions, np.array([[2.0, 4.0, -8.0], [9, 9, 9]])), [-0.05, 0]
+    )
 
 
 def test_joint_limits_count_the_upper_ones() -> None:
-    assert humanoid.joint_pos_limits(np.array([[0.99, 1.2, 0.98, -1.0], [0, 0, 0, 0]])).tolist() == [-2, 0]
+    assert humanoid.joint_pos_limits(
+        np.array([[0.99, 1.2, 0.98, -1.0], [0, 0, 0, 0]])
+    ).tolist() == [-2, 0]
 
 
 def test_ranges_include_their_lower_bound_only() -> None:
-    assert objectives.inside(at(0.5, 0.75, 1.0, np.nan), (0.5, 1.0)).tolist() == [True, True, False, False]
+    assert objectives.inside(at(0.5, 0.75, 1.0, np.nan), (0.5, 1.0)).tolist() == [
+        True,
+        True,
+        False,
+        False,
+    ]
     assert humanoid.energy_range(at(99, 100, 199, 200), (100, 200)).tolist() == [0, 5, 5, 0]
     assert humanoid.baseh_range(at(0.55, 0.9), (0.55, 0.7)).tolist() == [5, 0]
-    assert humanoid.armsp_range(np.array([[0.3, 0.3], [0.3, 0.5], [0.5, 0.5]]), (0.2, 0.4)).tolist() == [5, 2.5, 0]
+    assert humanoid.armsp_range(
+        np.array([[0.3, 0.3], [0.3, 0.5], [0.5, 0.5]]), (0.2, 0.4)
+    ).tolist() == [5, 2.5, 0]
 
 
 def test_stride_pays_for_the_time_in_the_air() -> None:
@@ -66,7 +80,9 @@ def test_ranges_do_not_overlap() -> None:
 def test_frames_and_angles() -> None:
     half = np.sqrt(0.5)
     quarter_turn_left = np.array([[half, 0, 0, half]])
-    np.testing.assert_allclose(geometry.into_frame(quarter_turn_left, np.array([[0.0, 1, 2]])), [[1, 0, 2]], atol=1e-12)
+    np.testing.assert_allclose(
+        geometry.into_frame(quarter_turn_left, np.array([[0.0, 1, 2]])), [[1, 0, 2]], atol=1e-12
+    )
     yaw, roll = geometry.yaw_and_roll(quarter_turn_left)
     np.testing.assert_allclose([yaw[0], roll[0]], [np.pi / 2, 0], atol=1e-12)
     yaw, roll = geometry.yaw_and_roll(np.array([[half, half, 0, 0]]))
@@ -77,7 +93,9 @@ def test_frames_and_angles() -> None:
     up, heading = humanoid.torso_projections(qpos)
     np.testing.assert_allclose(up, [1, 1], atol=1e-12)
     np.testing.assert_allclose(heading, [1, 0], atol=1e-12)
-    np.testing.assert_allclose(geometry.wrap(at(3.5, -3.5, 0.1)), [3.5 - 2 * np.pi, 2 * np.pi - 3.5, 0.1])
+    np.testing.assert_allclose(
+        geometry.wrap(at(3.5, -3.5, 0.1)), [3.5 - 2 * np.pi, 2 * np.pi - 3.5, 0.1]
+    )
 
 
 def test_body_is_gymnasiums_at_60_hz() -> None:
@@ -105,12 +123,17 @@ def test_energy_objective_replaces_the_energy_term() -> None:
 
 @pytest.mark.parametrize("index", [5, -1, 1.5, "2", True])
 def test_wrong_range_is_refused(index: object) -> None:
-    with pytest.raises(ValueError, match=r"Parameter `gait` must be None or the index of one of \{0: \(0.0, 0.2\), .* found"):
+    with pytest.raises(
+        ValueError,
+        match=r"Parameter `gait` must be None or the index of one of \{0: \(0.0, 0.2\), .* found",
+    ):
         humanoid.HumanoidMO(gait=index)  # type: ignore[arg-type]
 
 
 def test_feet_are_felt_and_strides_measured() -> None:
-    """The robot lands at the start; a foot that is then carried 0.5 m through the air makes a stride of about that length."""
+    """The robot lands at the start; a foot that is then carried 0.5 m through the air makes a
+    stride of about that length.
+    """
     task = humanoid.HumanoidMO(gait=2)
     engine = Engine(task, 1)
     engine.seed(0, 0)

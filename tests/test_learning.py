@@ -1,4 +1,6 @@
-"""It learns: a task and a regulariser that fight over one of two actions, where each resolver's optimum is known."""
+"""It learns: a task and a regulariser that fight over one of two actions, where each resolver's
+optimum is known.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,18 @@ from tests.envs import Valley
 def test_each_resolver_finds_its_optimum(resolver: str, low: float, high: float) -> None:
     kwargs = {"net_arch": [], "log_std_init": -1.0}
     env = make_vec_env(Valley, 8, seed=1)
-    model = GCRPPO("MlpPolicy", env, 0.01, n_steps=64, batch_size=512, resolver=resolver, seed=1, policy_kwargs=kwargs)
-    # Both want less noise, and that agreement would hide their conflict over x close to the optimum.
+    model = GCRPPO(
+        "MlpPolicy",
+        env,
+        0.01,
+        n_steps=64,
+        batch_size=512,
+        resolver=resolver,
+        seed=1,
+        policy_kwargs=kwargs,
+    )
+    # Both want less noise, and that agreement would hide their conflict over x close to the
+    # optimum.
     model.policy.log_std.requires_grad_(False)
     model.learn(16_000)
     x, y = model.predict(np.zeros(1), deterministic=True)[0]

@@ -38,7 +38,14 @@ def same(pairs: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "kwargs", [{}, {"eps": 1e-5}, {"betas": (0.5, 0.9), "weight_decay": 0.1}, {"amsgrad": True}, {"maximize": True}]
+    "kwargs",
+    [
+        {},
+        {"eps": 1e-5},
+        {"betas": (0.5, 0.9), "weight_decay": 0.1},
+        {"amsgrad": True},
+        {"maximize": True},
+    ],
 )
 def test_same_steps_as_pytorch(kwargs: Any) -> None:
     pairs = networks({"lr": 0.01, **kwargs})
@@ -68,7 +75,9 @@ def test_state_dicts_are_those_of_adam(source: int) -> None:
     train(pairs, 3)
     state = copy.deepcopy(pairs[source][1].state_dict())
     others = networks({"lr": 0.5})
-    for (parameters, optimizer), (origin, _) in zip(others, (pairs[source], pairs[source]), strict=True):
+    for (parameters, optimizer), (origin, _) in zip(
+        others, (pairs[source], pairs[source]), strict=True
+    ):
         with th.no_grad():
             for mine, theirs in zip(parameters, origin, strict=True):
                 mine.copy_(theirs)

@@ -18,61 +18,118 @@ ROOT = Path(__file__).parents[1]
 #: Modules of ours that each module may import.
 ARROWS = {
     "advantages": set(),
-    "gradients": {"advantages"},
+    "losses": {"advantages"},
     "resolvers": set(),
-    "one_backward": set(),
     "schedules": set(),
-    "components": set(),
     "optimisers": set(),
     "policies": {"optimisers"},
     "buffers": {"advantages"},
-    "diagnostics": {"components", "gradients", "resolvers"},
-    "evaluation": {"components"},
-    "report": {"components", "diagnostics"},
-    "vector_ppo": {"advantages", "buffers", "components", "diagnostics", "policies"},
+    "evaluation": {"rewards.reading", "rewards.spec"},
+    "rewards.__init__": set(),
+    "rewards.spec": set(),
+    "rewards.sums": {"rewards.spec"},
+    "rewards.decomposition": {"rewards.spec", "rewards.sums"},
+    "rewards.reading": {"rewards.decomposition", "rewards.spec", "rewards.sums"},
+    "gradients.__init__": set(),
+    "gradients.by_autograd": set(),
+    "gradients.gramian": {"gradients.memory"},
+    "gradients.layers": {"gradients.memory"},
+    "gradients.heads": {"gradients.memory"},
+    "gradients.memory": set(),
+    "gradients.by_hand": {
+        "gradients.gramian",
+        "gradients.heads",
+        "gradients.layers",
+        "gradients.memory",
+    },
+    "logs.__init__": set(),
+    "logs.figures": {"losses", "resolvers", "rewards.spec"},
+    "logs.shown": {"rewards.spec"},
+    "logs.report": {"logs.shown", "rewards.spec"},
+    "multi_head_ppo": {
+        "advantages",
+        "buffers",
+        "logs.shown",
+        "policies",
+        "rewards.reading",
+        "rewards.spec",
+    },
     "gcrppo": {
         "advantages",
-        "components",
-        "diagnostics",
-        "gradients",
-        "one_backward",
-        "persistent_ppo",
+        "gradients.by_autograd",
+        "gradients.by_hand",
+        "logs.figures",
+        "logs.shown",
+        "losses",
         "resolvers",
+        "rewards.decomposition",
+        "saving.model",
         "schedules",
     },
-    "checkpoints": set(),
-    "vec_statistics": set(),
-    "warm_start": set(),
-    "plain_settings": {"policies"},
-    "model_files": {"components", "plain_settings", "vec_statistics"},
-    "persistent_ppo": {"checkpoints", "model_files", "vec_statistics", "vector_ppo", "warm_start"},
-    "__init__": {"buffers", "checkpoints", "components", "envs", "evaluation", "gcrppo", "policies", "resolvers"},
-    "zoo": {"envs.envpool_gym"},
-    "envs.__init__": {"envs.envpool_gym", "envs.tasks"},
-    "envs.tasks": {"envs.task"},
-    "envs.task": {"components"},
-    "envs.geometry": set(),
-    "envs.objectives": set(),
-    "envs.humanoid": {"components", "envs.geometry", "envs.objectives", "envs.task"},
-    "envs.throwing": {"components", "envs.geometry", "envs.objectives", "envs.task"},
-    "envs.planar": {"components", "envs.task"},
+    "saving.__init__": set(),
+    "saving.checkpoints": set(),
+    "saving.statistics": set(),
+    "saving.warm_start": set(),
+    "saving.settings": {"policies"},
+    "saving.archive": {"rewards.spec", "saving.settings", "saving.statistics"},
+    "saving.model": {
+        "multi_head_ppo",
+        "saving.archive",
+        "saving.checkpoints",
+        "saving.statistics",
+        "saving.warm_start",
+    },
+    "__init__": {
+        "buffers",
+        "envs",
+        "evaluation",
+        "gcrppo",
+        "policies",
+        "resolvers",
+        "rewards.decomposition",
+        "rewards.spec",
+        "saving.checkpoints",
+    },
+    "zoo.__init__": {"zoo.commands"},
+    "zoo.__main__": {"zoo.commands"},
+    "zoo.commands": {"simulators.envpool_gym"},
+    "envs.__init__": {"envs.tasks.catalogue", "simulators.envpool_gym"},
+    "envs.task": {"rewards.spec"},
     "envs.curriculum": set(),
     "envs.engine": {"envs.task"},
-    "envs.single": {"components", "envs.engine", "envs.tasks"},
-    "envs.batched": {"components", "envs.engine", "envs.single"},
-    "envs.vector": {"components", "envs.engine", "envs.tasks"},
-    "envs.envpool": {"components"},
-    "envs.envpool_gym": {"components", "envs.envpool"},
+    "envs.single": {"envs.engine", "envs.tasks.catalogue", "rewards.spec"},
+    "envs.batched": {"envs.engine", "envs.single", "rewards.spec"},
+    "envs.vector": {"envs.engine", "envs.tasks.catalogue", "rewards.spec"},
+    "envs.tasks.__init__": set(),
+    "envs.tasks.catalogue": {"envs.task"},
+    "envs.tasks.geometry": set(),
+    "envs.tasks.ranges": set(),
+    "envs.tasks.humanoid": {
+        "envs.task",
+        "envs.tasks.geometry",
+        "envs.tasks.ranges",
+        "rewards.spec",
+    },
+    "envs.tasks.throwing": {
+        "envs.task",
+        "envs.tasks.geometry",
+        "envs.tasks.ranges",
+        "rewards.spec",
+    },
+    "envs.tasks.planar": {"envs.task", "rewards.decomposition", "rewards.spec"},
+    "simulators.__init__": set(),
+    "simulators.envpool": {"rewards.spec"},
+    "simulators.envpool_gym": {"rewards.spec", "simulators.envpool"},
 }
 #: Packages that the pure modules do without.
 FORBIDDEN = {
     "advantages": {"torch", "stable_baselines3"},
     "resolvers": {"stable_baselines3"},
-    "gradients": {"stable_baselines3"},
+    "losses": {"stable_baselines3"},
     "envs.task": {"torch", "stable_baselines3"},
-    "envs.humanoid": {"torch", "stable_baselines3"},
-    "envs.planar": {"torch", "stable_baselines3"},
-    "envs.throwing": {"torch", "stable_baselines3"},
+    "envs.tasks.humanoid": {"torch", "stable_baselines3"},
+    "envs.tasks.planar": {"torch", "stable_baselines3"},
+    "envs.tasks.throwing": {"torch", "stable_baselines3"},
     "envs.engine": {"torch", "stable_baselines3"},
 }
 MODULES = {
@@ -114,7 +171,10 @@ def test_every_public_name_exists_and_is_documented() -> None:
 
 def test_import_is_silent() -> None:
     result = subprocess.run(
-        [sys.executable, "-W", "error", "-c", "import sb3_gcr"], capture_output=True, text=True, check=True
+        [sys.executable, "-W", "error", "-c", "import sb3_gcr"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert result.stdout == result.stderr == ""
 
@@ -131,7 +191,14 @@ def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     exec(compile(code, "README.md", "exec"), namespace)
     namespace["model"].logger.close()  # type: ignore[attr-defined]
     written = {path.name for path in (tmp_path / "logs/humanoid").iterdir()}
-    assert {"model.zip", "progress.csv", "cosines.csv", "returns.png", "cosines.png", "conflicts.png"} <= written
+    assert {
+        "model.zip",
+        "progress.csv",
+        "cosines.csv",
+        "returns.png",
+        "cosines.png",
+        "conflicts.png",
+    } <= written
 
 
 def test_yaml_files_parse_and_the_version_is_one() -> None:
@@ -142,11 +209,16 @@ def test_yaml_files_parse_and_the_version_is_one() -> None:
 
 
 def test_make_lists_its_commands_and_refuses_without_python(tmp_path: Path) -> None:
-    listed = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    listed = subprocess.run(
+        ["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
     for command in ("train", "test", "check", "format", "bench", "compare"):
         assert f"make {command}" in listed
     missing = subprocess.run(
-        ["make", "install", "PYTHON=no-such-python", f"VENV={tmp_path}/none"], cwd=ROOT, capture_output=True, text=True
+        ["make", "install", "PYTHON=no-such-python", f"VENV={tmp_path}/none"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     assert missing.returncode != 0
     assert "sb3_gcr needs Python 3.10 or newer: 'no-such-python' was not found." in missing.stdout
@@ -162,7 +234,13 @@ def test_make_lists_its_commands_and_refuses_without_python(tmp_path: Path) -> N
     ],
 )
 def test_train_says_what_is_wrong(arguments: list[str], message: str, tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "examples/train.py"), "--folder", str(tmp_path), *arguments]
+    command = [
+        sys.executable,
+        str(ROOT / "examples/train.py"),
+        "--folder",
+        str(tmp_path),
+        *arguments,
+    ]
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 2
     assert message in result.stderr

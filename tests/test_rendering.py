@@ -33,7 +33,9 @@ skin = lambda picture: ((picture[..., 0] - picture[..., 2]) > 40).sum()
 env.close(); many.close()
 print(picture.shape, first.shape, (first != third).mean() > 0.001)
 print(skin(far) > 0.5 * skin(third.astype(int)) > 100)
-print(((red > 120) & (green < 60) & (blue < 60)).sum() > 5, ((red > 150) & (green > 70) & (red - blue > 90)).sum() > 3)
+ball = (red > 120) & (green < 60) & (blue < 60)
+target = (red > 150) & (green > 70) & (red - blue > 90)
+print(ball.sum() > 5, target.sum() > 3)
 """
 NO_CONTEXT = """
 import gymnasium as gym, sb3_gcr
@@ -47,9 +49,16 @@ except RuntimeError as error:
 
 
 def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}
+    environment = {
+        key: value
+        for key, value in os.environ.items()
+        if key not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
+    }
     return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env={**environment, "OMP_NUM_THREADS": "1", **variables}
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env={**environment, "OMP_NUM_THREADS": "1", **variables},
     )
 
 
@@ -64,4 +73,6 @@ def test_missing_opengl_is_told_in_one_sentence() -> None:
     result = run(NO_CONTEXT)
     if result.returncode == 0 and not result.stdout:
         pytest.skip("OpenGL works here without being asked for")
-    assert result.stdout.startswith("No picture could be rendered: MuJoCo found no OpenGL context. Without a screen, set the")
+    assert result.stdout.startswith(
+        "No picture could be rendered: MuJoCo found no OpenGL context. Without a screen, set the"
+    )

@@ -10,7 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_gcr import RESOLVERS
-from sb3_gcr.resolvers import FEW, conflicts, cosines, gcr, gcr_authors, guaranteed, no_priority, visiting_order
+from sb3_gcr.resolvers import (
+    FEW,
+    conflicts,
+    cosines,
+    gcr,
+    gcr_authors,
+    guaranteed,
+    no_priority,
+    visiting_order,
+)
 from tests.oracles import authors_in_place, pcgrad_with_levels, random_jacobian
 
 TASK, REGULARISER = 0, 1
@@ -24,7 +33,9 @@ def step(resolver: Any, jacobian: Any, levels: Any, rng: Any = None) -> Any:
 
 
 def all_steps(resolver: Any, jacobian: Any, levels: Any, draws: int = 200) -> Any:
-    return np.array([step(resolver, jacobian, levels, np.random.default_rng(seed)) for seed in range(draws)])
+    return np.array(
+        [step(resolver, jacobian, levels, np.random.default_rng(seed)) for seed in range(draws)]
+    )
 
 
 @pytest.mark.parametrize("name", list(RESOLVERS))
@@ -48,12 +59,16 @@ def test_orthogonal_up_to_rounding_is_no_conflict(name: str) -> None:
 def test_gcr_is_the_papers_projection_in_gradient_space(levels: list[int], seed: int) -> None:
     jacobian = random_jacobian(np.random.default_rng(seed), 5, 4)
     expected = pcgrad_with_levels(jacobian, levels, np.random.default_rng(seed))
-    np.testing.assert_allclose(step(gcr, jacobian, levels, np.random.default_rng(seed)), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        step(gcr, jacobian, levels, np.random.default_rng(seed)), expected, rtol=1e-9, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("n", [FEW, FEW + 1])
 def test_rounding_is_no_conflict_for_few_or_many(n: int) -> None:
-    """A small gradient next to a huge one: what rounding makes of orthogonal must not show in its weight."""
+    """A small gradient next to a huge one: what rounding makes of orthogonal must not show in its
+    weight.
+    """
     gramian = np.eye(n)
     gramian[0, 0] = 1e24
     gramian[0, 1] = gramian[1, 0] = -1e-2  # cosine -1e-14
@@ -97,19 +112,32 @@ def test_gcr_on_one_level_is_no_priority(seed: int) -> None:
     jacobian = random_jacobian(np.random.default_rng(seed), 5, 3)
     for level in (0, 3):
         same = step(gcr, jacobian, [level] * 5, np.random.default_rng(seed))
-        np.testing.assert_array_equal(same, step(no_priority, jacobian, [0, 1, 2, 1, 0], np.random.default_rng(seed)))
+        np.testing.assert_array_equal(
+            same, step(no_priority, jacobian, [0, 1, 2, 1, 0], np.random.default_rng(seed))
+        )
 
 
 @pytest.mark.parametrize("name", ["gcr", "guaranteed"])
 @settings(max_examples=200, deadline=None)
-@given(seed=st.integers(0, 2**31), n=st.integers(2, 7), size=st.integers(2, 8), log_scale=st.floats(-8, 8))
-def test_one_task_is_never_weakened(name: str, seed: int, n: int, size: int, log_scale: float) -> None:
+@given(
+    seed=st.integers(0, 2**31),
+    n=st.integers(2, 7),
+    size=st.integers(2, 8),
+    log_scale=st.floats(-8, 8),
+)
+def test_one_task_is_never_weakened(
+    name: str, seed: int, n: int, size: int, log_scale: float
+) -> None:
     rng = np.random.default_rng(seed)
     jacobian = random_jacobian(rng, n, size) * 10**log_scale
     task = int(rng.integers(n))
     levels = np.where(np.arange(n) == task, TASK, rng.integers(1, 4, n))
     descent = step(RESOLVERS[name], jacobian, levels, rng) @ jacobian[task]
-    assert descent >= jacobian[task] @ jacobian[task] * (1 - 1e-6) - 1e-9 * np.abs(jacobian @ jacobian[task]).sum()
+    assert (
+        descent
+        >= jacobian[task] @ jacobian[task] * (1 - 1e-6)
+        - 1e-9 * np.abs(jacobian @ jacobian[task]).sum()
+    )
 
 
 @pytest.mark.parametrize("name", ["gcr", "gcr_authors", "no_priority"])
@@ -124,7 +152,9 @@ def test_sequential_projections_only_raise_weights(name: str) -> None:
 
 
 def test_two_conflicting_tasks_lose_under_sequential_projection() -> None:
-    """The counter-example: with two tasks that conflict a regulariser can undo one of them, whatever the order."""
+    """The counter-example: with two tasks that conflict a regulariser can undo one of them,
+    whatever the order.
+    """
     jacobian, levels = np.array([[1, 0], [-0.6, 0.8], [-3, -3]]), [TASK, TASK, REGULARISER]
     found = {tuple(np.round(row, 6) + 0.0) for row in all_steps(gcr, jacobian, levels)}
     assert found == {(-0.8, 0.2), (0.64, -1.24)}
@@ -145,7 +175,9 @@ def test_in_place_projection_makes_two_tasks_lose() -> None:
     jacobian = np.array([[1.0, 0.0], [-0.7, np.sqrt(1 - 0.49)]])
     gains = all_steps(gcr_authors, jacobian, [TASK, TASK]) @ jacobian.T
     assert gains.min() == pytest.approx(-0.19, abs=0.005)
-    np.testing.assert_allclose(all_steps(gcr, jacobian, [TASK, TASK]) @ jacobian.T, 0.51, atol=0.005)
+    np.testing.assert_allclose(
+        all_steps(gcr, jacobian, [TASK, TASK]) @ jacobian.T, 0.51, atol=0.005
+    )
 
 
 def test_published_pcgrad_weights() -> None:
@@ -163,14 +195,18 @@ def test_guaranteed_never_harms_a_higher_level(seed: int) -> None:
     for level in range(4):
         up_to = step(guaranteed, jacobian[levels <= level], levels[levels <= level])
         for member in jacobian[levels < level]:
-            assert (up_to - below) @ member >= -1e-8 * np.linalg.norm(up_to) * np.linalg.norm(member)
+            assert (up_to - below) @ member >= -1e-8 * np.linalg.norm(up_to) * np.linalg.norm(
+                member
+            )
         if level == 0:
             assert (up_to @ jacobian[levels == 0].T >= -1e-8 * np.linalg.norm(up_to)).all()
         below = up_to
 
 
 def test_guaranteed_solves_its_projections() -> None:
-    """Optimality conditions of the cone projection of a regulariser: λ ≥ 0, no harm, and λ_j > 0 only where the gain is 0."""
+    """Optimality conditions of the cone projection of a regulariser: λ ≥ 0, no harm, and λ_j > 0
+    only where the gain is 0.
+    """
     rng = np.random.default_rng(3)
     for _ in range(50):
         tasks, regulariser = np.abs(rng.normal(size=(3, 5))), rng.normal(size=(1, 5))
@@ -195,11 +231,20 @@ def test_permuting_components_permutes_the_weights(name: str) -> None:
     rng = np.random.default_rng(5)
     jacobian = random_jacobian(rng, 3, 4)
     jacobian[1] = -0.8 * jacobian[0] + 0.1 * jacobian[1]
-    levels, order = np.array([0, 1, 2]), np.array([2, 0, 1])  # one component a level, so that nothing is drawn
+    levels, order = (
+        np.array([0, 1, 2]),
+        np.array([2, 0, 1]),
+    )  # one component a level, so that nothing is drawn
     if name in ("no_priority", "gcr_authors"):  # order matters: compare what all draws reach
-        all_draws = [RESOLVERS[name](jacobian @ jacobian.T, levels, np.random.default_rng(s))[order] for s in range(300)]
+        all_draws = [
+            RESOLVERS[name](jacobian @ jacobian.T, levels, np.random.default_rng(s))[order]
+            for s in range(300)
+        ]
         permuted = jacobian[order]
-        again = [RESOLVERS[name](permuted @ permuted.T, levels[order], np.random.default_rng(s)) for s in range(300)]
+        again = [
+            RESOLVERS[name](permuted @ permuted.T, levels[order], np.random.default_rng(s))
+            for s in range(300)
+        ]
         assert {tuple(w.round(6)) for w in all_draws} == {tuple(w.round(6)) for w in again}
         return
     weights = RESOLVERS[name](jacobian @ jacobian.T, levels, np.random.default_rng(0))
@@ -214,7 +259,9 @@ def test_scaling_all_gradients_leaves_the_weights(name: str, scale: float) -> No
     jacobian = random_jacobian(np.random.default_rng(7), 6, 4)
     levels = np.array([0, 0, 1, 1, 2, 2])
     weights = RESOLVERS[name](jacobian @ jacobian.T, levels, np.random.default_rng(0))
-    scaled = RESOLVERS[name]((scale * jacobian) @ (scale * jacobian).T, levels, np.random.default_rng(0))
+    scaled = RESOLVERS[name](
+        (scale * jacobian) @ (scale * jacobian).T, levels, np.random.default_rng(0)
+    )
     np.testing.assert_allclose(scaled, weights, rtol=1e-6)
 
 
@@ -224,7 +271,9 @@ def test_a_component_without_gradient_is_skipped(name: str) -> None:
     levels = np.array([0, 0, 1, 1])
     weights = RESOLVERS[name](jacobian @ jacobian.T, levels, np.random.default_rng(0))
     others = [0, 2, 3]
-    alone = RESOLVERS[name](jacobian[others] @ jacobian[others].T, levels[others], np.random.default_rng(0))
+    alone = RESOLVERS[name](
+        jacobian[others] @ jacobian[others].T, levels[others], np.random.default_rng(0)
+    )
     assert np.isfinite(weights).all()
     assert weights[1] == 1
     if name in ("sum", "guaranteed"):
@@ -233,7 +282,9 @@ def test_a_component_without_gradient_is_skipped(name: str) -> None:
 
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
 def test_opposed_and_rank_one_gradients(scale: float) -> None:
-    """A regulariser straight against the task vanishes; gradients of one direction are a question of sign alone."""
+    """A regulariser straight against the task vanishes; gradients of one direction are a question
+    of sign alone.
+    """
     jacobian = scale * np.array([[1.0, 2.0], [-3.0, -6.0], [0.5, 1.0]])
     for resolver in (gcr, guaranteed):
         direction = step(resolver, jacobian, [TASK, REGULARISER, TASK])
@@ -241,9 +292,11 @@ def test_opposed_and_rank_one_gradients(scale: float) -> None:
 
 
 def test_share_of_draws_in_which_a_task_gets_worse() -> None:
-    """4 tasks, 3 regularisers, D = 10, Gaussian directions, log-normal norms with sd 1; seed 0, 2000 draws.
+    """4 tasks, 3 regularisers, D = 10, Gaussian directions, log-normal norms with sd 1; seed 0,
+    2000 draws.
 
-    The share with no regulariser-regulariser projection in gradient space is METHOD's 10 %; ours adds that projection.
+    The share with no regulariser-regulariser projection in gradient space is METHOD's 10 %; ours
+    adds that projection.
     """
     rng = np.random.default_rng(0)
     levels = np.array([0] * 4 + [1] * 3)
@@ -264,5 +317,11 @@ def test_share_of_draws_in_which_a_task_gets_worse() -> None:
 def test_conflicts_and_cosines() -> None:
     jacobian = np.array([[1.0, 0.0], [-2.0, 2.0], [0.0, 0.0]])
     gramian = jacobian @ jacobian.T
-    assert conflicts(gramian).tolist() == [[False, True, False], [True, False, False], [False, False, False]]
-    np.testing.assert_allclose(cosines(gramian), [[1, -(0.5**0.5), 0], [-(0.5**0.5), 1, 0], [0, 0, 0]])
+    assert conflicts(gramian).tolist() == [
+        [False, True, False],
+        [True, False, False],
+        [False, False, False],
+    ]
+    np.testing.assert_allclose(
+        cosines(gramian), [[1, -(0.5**0.5), 0], [-(0.5**0.5), 1, 0], [0, 0, 0]]
+    )

@@ -1,4 +1,6 @@
-"""``load(weights_only=True)`` runs nothing that is in the file, and says what it cannot do without."""
+"""``load(weights_only=True)`` runs nothing that is in the file, and says what it cannot do
+without.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
 from sb3_gcr import GCRPPO, MlpPolicy, RewardSpec, VectorRolloutBuffer
-from sb3_gcr.plain_settings import SETTINGS, collect_settings, to_plain
+from sb3_gcr.saving.settings import SETTINGS, collect_settings, to_plain
 from tests.envs import SPEC, Env
 
 SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 16, "n_epochs": 2, "seed": 0, "device": "cpu"}
@@ -39,7 +41,9 @@ def _audit(event: str, args: Any) -> None:
         _unpickled.append(".".join(args))
 
 
-sys.addaudithook(_audit)  # raised by every Unpickler of the standard library; it cannot be taken off again
+sys.addaudithook(
+    _audit
+)  # raised by every Unpickler of the standard library; it cannot be taken off again
 
 
 @pytest.fixture
@@ -113,12 +117,19 @@ def path(tmp_path: Path) -> Path:
 
 def test_no_code_of_the_file_runs(path: Path, tmp_path: Path, unpickled: list[str]) -> None:
     GCRPPO("MlpPolicy", make_vec_env(Env, 1), **SMALL).learn(32).save(path)
-    bombs = {name: tmp_path / f"exploded_{index}" for index, name in enumerate(("data", "other", "variables"))}
+    bombs = {
+        name: tmp_path / f"exploded_{index}"
+        for index, name in enumerate(("data", "other", "variables"))
+    }
     pickled = {name: pickle.dumps(Bomb(bomb)) for name, bomb in bombs.items()}
     with zipfile.ZipFile(path) as archive:
         data = json.loads(archive.read("data"))
     data["extra"] = {":type:": "float", ":serialized:": base64.b64encode(pickled["data"]).decode()}
-    entries = {"data": json.dumps(data), "other.pth": pickled["other"], "pytorch_variables.pth": pickled["variables"]}
+    entries = {
+        "data": json.dumps(data),
+        "other.pth": pickled["other"],
+        "pytorch_variables.pth": pickled["variables"],
+    }
     rewrite(path, **entries)
     assert not unpickled
     for load in (GCRPPO.load, GCRPPO.warm_start):
@@ -143,7 +154,9 @@ def test_weights_that_are_more_than_tensors_are_refused(
     if kind != "pickle":
         th.save(state, stream, _use_new_zipfile_serialization=kind == "torch")
     rewrite(path, **{name: stream.getvalue()})
-    with pytest.raises(ValueError, match=rf"^The entry '{name}' must hold tensors and nothing else: "):
+    with pytest.raises(
+        ValueError, match=rf"^The entry '{name}' must hold tensors and nothing else: "
+    ):
         GCRPPO.load(path, make_vec_env(Env, 1), weights_only=True)
     assert not unpickled
     assert list(tmp_path.iterdir()) == [path]
@@ -155,20 +168,58 @@ def test_weights_that_are_more_than_tensors_are_refused(
 @pytest.mark.parametrize(
     ("policy", "observation", "kwargs"),
     [
-        ("MlpPolicy", "Box", {"resolver": "guaranteed", "desired_kl": 0.01, "clip_range_vf": 0.3, "target_kl": 1.0}),
         (
             "MlpPolicy",
             "Box",
-            {"use_sde": True, "policy_kwargs": {"activation_fn": nn.ELU, "net_arch": {"pi": [8], "vf": [9]}}},
+            {"resolver": "guaranteed", "desired_kl": 0.01, "clip_range_vf": 0.3, "target_kl": 1.0},
         ),
-        ("MlpPolicy", "Box", {"policy_kwargs": {"optimizer_class": th.optim.AdamW, "share_features_extractor": False}}),
-        ("MlpPolicy", "Box", {"policy_kwargs": {"optimizer_kwargs": {"betas": (0.8, 0.9)}}, "stats_window_size": 7}),
-        ("MultiInputPolicy", "DictImage", {"gramian_samples": 8, "advantage_scope": "minibatch", "kappa_max": 3.0}),
-        ("CnnPolicy", "ImageChannelsLast", {"policy_kwargs": {"features_extractor_kwargs": {"features_dim": 16}}}),
-        ("MlpPolicy", "Box", {"learning_rate": ConstantSchedule(0.001), "n_steps": np.int64(16), "gamma": np.float32(0.5)}),
+        (
+            "MlpPolicy",
+            "Box",
+            {
+                "use_sde": True,
+                "policy_kwargs": {"activation_fn": nn.ELU, "net_arch": {"pi": [8], "vf": [9]}},
+            },
+        ),
+        (
+            "MlpPolicy",
+            "Box",
+            {
+                "policy_kwargs": {
+                    "optimizer_class": th.optim.AdamW,
+                    "share_features_extractor": False,
+                }
+            },
+        ),
+        (
+            "MlpPolicy",
+            "Box",
+            {"policy_kwargs": {"optimizer_kwargs": {"betas": (0.8, 0.9)}}, "stats_window_size": 7},
+        ),
+        (
+            "MultiInputPolicy",
+            "DictImage",
+            {"gramian_samples": 8, "advantage_scope": "minibatch", "kappa_max": 3.0},
+        ),
+        (
+            "CnnPolicy",
+            "ImageChannelsLast",
+            {"policy_kwargs": {"features_extractor_kwargs": {"features_dim": 16}}},
+        ),
+        (
+            "MlpPolicy",
+            "Box",
+            {
+                "learning_rate": ConstantSchedule(0.001),
+                "n_steps": np.int64(16),
+                "gamma": np.float32(0.5),
+            },
+        ),
     ],
 )
-def test_plain_models_come_back(path: Path, policy: str, observation: str, kwargs: Any, unpickled: list[str]) -> None:
+def test_plain_models_come_back(
+    path: Path, policy: str, observation: str, kwargs: Any, unpickled: list[str]
+) -> None:
     env = make_vec_env(lambda: Env(observation=observation), 2, seed=0)
     model = GCRPPO(policy, env, **{**SMALL, "seed": None, **kwargs}).learn(64)
     model.save(path)
@@ -176,14 +227,22 @@ def test_plain_models_come_back(path: Path, policy: str, observation: str, kwarg
     assert not unpickled
     full = GCRPPO.load(path, env, device="cpu")
     assert th.equal(parameters(loaded), parameters(full))
-    settings = [to_plain(collect_settings({**one.__dict__, "policy_kwargs": None})) for one in (loaded, full)]
+    settings = [
+        to_plain(collect_settings({**one.__dict__, "policy_kwargs": None}))
+        for one in (loaded, full)
+    ]
     assert settings[0] == settings[1]
     assert loaded.reward_spec == full.reward_spec
     for name in ("num_timesteps", "_n_updates", "_adaptive_learning_rate", "_n_rollouts_learned"):
         assert getattr(loaded, name) == getattr(full, name)
     assert repr(loaded.policy.optimizer) == repr(full.policy.optimizer)
-    steps = [optimizer.state_dict()["state"] for optimizer in (loaded.policy.optimizer, full.policy.optimizer)]
-    assert all(th.equal(steps[0][i][key], steps[1][i][key]) for i in steps[0] for key in steps[0][i])
+    steps = [
+        optimizer.state_dict()["state"]
+        for optimizer in (loaded.policy.optimizer, full.policy.optimizer)
+    ]
+    assert all(
+        th.equal(steps[0][i][key], steps[1][i][key]) for i in steps[0] for key in steps[0][i]
+    )
     for one in (loaded, full):
         one.set_random_seed(1)
         env.seed(1)
@@ -193,7 +252,9 @@ def test_plain_models_come_back(path: Path, policy: str, observation: str, kwarg
     assert th.equal(parameters(loaded), parameters(full))  # and goes on alike
 
 
-def test_vec_normalize_and_the_order_of_the_heads_come_back(path: Path, unpickled: list[str]) -> None:
+def test_vec_normalize_and_the_order_of_the_heads_come_back(
+    path: Path, unpickled: list[str]
+) -> None:
     model = GCRPPO("MlpPolicy", VecNormalize(make_vec_env(Env, 2, seed=0)), **SMALL).learn(64)
     model.save(path)
     permuted = RewardSpec(SPEC.names[::-1], SPEC.levels[::-1])
@@ -210,18 +271,27 @@ def test_one_objective(path: Path) -> None:
         env = make_vec_env(lambda: Env(None), 1)
         model = GCRPPO(policy, env, **SMALL).learn(32)
         model.save(path)
-        assert th.equal(parameters(GCRPPO.load(path, env, weights_only=True).learn(0)), parameters(model))
+        assert th.equal(
+            parameters(GCRPPO.load(path, env, weights_only=True).learn(0)), parameters(model)
+        )
 
 
 def test_arguments_can_be_changed_and_logs_go_nowhere(path: Path, tmp_path: Path) -> None:
-    GCRPPO("MlpPolicy", make_vec_env(Env, 1), tensorboard_log=str(tmp_path / "theirs"), **SMALL).save(path)
+    GCRPPO(
+        "MlpPolicy", make_vec_env(Env, 1), tensorboard_log=str(tmp_path / "theirs"), **SMALL
+    ).save(path)
     loaded = GCRPPO.load(path, make_vec_env(Env, 1), weights_only=True, resolver="sum", n_steps=16)
     assert (loaded.resolver, loaded.n_steps, loaded.tensorboard_log) == ("sum", 16, None)
     assert "theirs" not in zipfile.ZipFile(path).read("sb3_gcr.json").decode()
 
 
 def test_the_settings_are_all_that_the_constructor_takes() -> None:
-    assert set(SETTINGS) == set(inspect.signature(GCRPPO).parameters) - {"policy", "env", "device", "_init_setup_model"}
+    assert set(SETTINGS) == set(inspect.signature(GCRPPO).parameters) - {
+        "policy",
+        "env",
+        "device",
+        "_init_setup_model",
+    }
 
 
 # === What is not plain is refused ===
@@ -232,22 +302,37 @@ def test_the_settings_are_all_that_the_constructor_takes() -> None:
     [
         (Policy, {}, "policy (class Policy)"),
         ("MlpPolicy", {"resolver": my_resolver}, "resolver (function my_resolver)"),
-        ("MlpPolicy", {"learning_rate": LinearSchedule(1e-3, 0.0, 1.0)}, "learning_rate (LinearSchedule object)"),
+        (
+            "MlpPolicy",
+            {"learning_rate": LinearSchedule(1e-3, 0.0, 1.0)},
+            "learning_rate (LinearSchedule object)",
+        ),
         ("MlpPolicy", {"rollout_buffer_class": Buffer}, "rollout_buffer_class (class Buffer)"),
         (
             "MlpPolicy",
-            {"clip_range": my_resolver.__get__(1), "policy_kwargs": {"features_extractor_class": Extractor, "net_arch": [8]}},
-            "clip_range (function my_resolver), policy_kwargs['features_extractor_class'] (class Extractor)",
+            {
+                "clip_range": my_resolver.__get__(1),
+                "policy_kwargs": {"features_extractor_class": Extractor, "net_arch": [8]},
+            },
+            "clip_range (function my_resolver), policy_kwargs['features_extractor_class'] (class "
+            "Extractor)",
         ),
-        ("MlpPolicy", {"policy_kwargs": {"activation_fn": nn.PReLU}}, "policy_kwargs['activation_fn'] (class PReLU)"),
+        (
+            "MlpPolicy",
+            {"policy_kwargs": {"activation_fn": nn.PReLU}},
+            "policy_kwargs['activation_fn'] (class PReLU)",
+        ),
     ],
 )
-def test_what_a_file_needs_is_named_and_can_be_given(path: Path, policy: Any, kwargs: Any, listed: str) -> None:
+def test_what_a_file_needs_is_named_and_can_be_given(
+    path: Path, policy: Any, kwargs: Any, listed: str
+) -> None:
     env = make_vec_env(Env, 1)
     model = GCRPPO(policy, env, **SMALL, **kwargs)
     model.save(path)
     message = (
-        f"Parameter `weights_only` must be False for this file, found True: it needs {listed}. Give what is missing as "
+        f"Parameter `weights_only` must be False for this file, found True: it needs {listed}. "
+        "Give what is missing as "
         "keyword arguments, or load it without, if you trust it."
     )
     for load in (GCRPPO.load, GCRPPO.warm_start):
@@ -262,18 +347,25 @@ def test_what_a_file_needs_is_named_and_can_be_given(path: Path, policy: Any, kw
 def test_files_without_plain_settings_are_refused(path: Path) -> None:
     PPO("MlpPolicy", make_vec_env(lambda: Env(None), 1), **SMALL).save(path)
     message = (
-        "Parameter `weights_only` must be False for this file, found True: it has no entry 'sb3_gcr.json', which "
+        "Parameter `weights_only` must be False for this file, found True: it has no entry "
+        "'sb3_gcr.json', which "
         "`GCRPPO.save` writes. Load it without, if you trust it."
     )
     with pytest.raises(ValueError, match=exactly(message)):
         GCRPPO.load(path, make_vec_env(Env, 1), weights_only=True)
     with pytest.raises(
-        ValueError, match=exactly("Parameter `env` must be an environment for `weights_only=True`, found None.")
+        ValueError,
+        match=exactly(
+            "Parameter `env` must be an environment for `weights_only=True`, found None."
+        ),
     ):
         GCRPPO.load(path, weights_only=True)
     path.write_text("no zip")
     with pytest.raises(
-        ValueError, match=exactly(f"Parameter `path` must be a zip file, found {path}: File is not a zip file.")
+        ValueError,
+        match=exactly(
+            f"Parameter `path` must be a zip file, found {path}: File is not a zip file."
+        ),
     ):
         GCRPPO.load(path, make_vec_env(Env, 1), weights_only=True)
 
@@ -282,38 +374,53 @@ def test_files_without_plain_settings_are_refused(path: Path) -> None:
     ("changes", "message"),
     [
         ({"format": 2}, "The entry 'sb3_gcr.json' must have format 1, found 2."),
-        ({"settings": {"env": "x"}}, "The settings in a file must be arguments of GCRPPO, found ['env']."),
+        (
+            {"settings": {"env": "x"}},
+            "The settings in a file must be arguments of GCRPPO, found ['env'].",
+        ),
         (
             {"settings": {"tensorboard_log": "x", "rollout_buffer_class": "y"}},
-            "The settings in a file must be arguments of GCRPPO, found ['rollout_buffer_class', 'tensorboard_log'].",
+            "The settings in a file must be arguments of GCRPPO, found ['rollout_buffer_class', "
+            "'tensorboard_log'].",
         ),
         (
             {"settings": {"policy_kwargs": {"optimizer_class": "os.system"}}},
-            "`policy_kwargs['optimizer_class']` in a file must be one of ['Adam', 'AdamW', 'RMSprop', 'RMSpropTFLike', "
+            "`policy_kwargs['optimizer_class']` in a file must be one of ['Adam', 'AdamW', "
+            "'RMSprop', 'RMSpropTFLike', "
             "'SGD'], found 'os.system'.",
         ),
         (
             {"counters": {"policy": 3}},
-            "The counters in a file must be numbers named ['num_timesteps', '_n_updates', '_n_rollouts_learned', "
+            "The counters in a file must be numbers named ['num_timesteps', '_n_updates', "
+            "'_n_rollouts_learned', "
             "'_adaptive_learning_rate'], found policy=3.",
         ),
         (
             {"counters": {"num_timesteps": "many"}},
-            "The counters in a file must be numbers named ['num_timesteps', '_n_updates', '_n_rollouts_learned', "
+            "The counters in a file must be numbers named ['num_timesteps', '_n_updates', "
+            "'_n_rollouts_learned', "
             "'_adaptive_learning_rate'], found num_timesteps='many'.",
         ),
         (
             {"policy": None},
-            "Parameter `policy` must be one of ['CnnPolicy', 'MlpPolicy', 'MultiInputPolicy'] or a subclass of "
-            "MultiHeadActorCriticPolicy, found 'None'. Recurrent and maskable policies are not supported.",
+            "Parameter `policy` must be one of ['CnnPolicy', 'MlpPolicy', 'MultiInputPolicy'] or a "
+            "subclass of "
+            "MultiHeadActorCriticPolicy, found 'None'. Recurrent and maskable policies are not "
+            "supported.",
         ),
         (
-            {"vec_normalize": {"observations": {"": {"mean": [0.0], "var": [1.0], "count": 5}}, "returns": {}}},
+            {
+                "vec_normalize": {
+                    "observations": {"": {"mean": [0.0], "var": [1.0], "count": 5}},
+                    "returns": {},
+                }
+            },
             "The saved statistics must have shape (4,), found (1,) and (1,).",
         ),
         (
             {"components": {"go": 0, "stay": 0, "shine": 1}},
-            "The env's reward components must be those of the model: the model has ['go', 'stay', 'shine'], found "
+            "The env's reward components must be those of the model: the model has ['go', 'stay', "
+            "'shine'], found "
             "['go', 'stay', 'save'] in the env.",
         ),
     ],
@@ -326,7 +433,12 @@ def test_a_forged_description_is_refused(path: Path, changes: Any, message: str)
 
 
 def test_saving_never_fails_for_what_is_not_plain(path: Path) -> None:
-    kwargs = {"resolver": lambda *_, **__: np.ones(3), "resolver_kwargs": {"a": np.zeros(2), "b": {1: 2}}}
+    kwargs = {
+        "resolver": lambda *_, **__: np.ones(3),
+        "resolver_kwargs": {"a": np.zeros(2), "b": {1: 2}},
+    }
     GCRPPO("MlpPolicy", make_vec_env(Env, 1), **SMALL, **kwargs).save(path)
-    with pytest.raises(ValueError, match=r"resolver \(function .*<lambda>\), resolver_kwargs \(dict object\)"):
+    with pytest.raises(
+        ValueError, match=r"resolver \(function .*<lambda>\), resolver_kwargs \(dict object\)"
+    ):
         GCRPPO.load(path, make_vec_env(Env, 1), weights_only=True)

@@ -41,10 +41,29 @@ def path(tmp_path: Path) -> Path:
         {},
         {"resolver": "guaranteed", "desired_kl": 0.01},
         {"resolver": my_resolver, "resolver_kwargs": {"factor": 2.0}},
-        {"use_sde": True, "clip_range_vf": 0.2, "clip_range": lambda progress: 0.1 + 0.1 * progress},
-        {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [9, 9]}, "share_features_extractor": False}},
-        {"policy_kwargs": {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.1}}},
-        {"gramian_samples": 8, "gramian_method": "passes", "advantage_scope": "minibatch", "kappa_max": 3.0},
+        {
+            "use_sde": True,
+            "clip_range_vf": 0.2,
+            "clip_range": lambda progress: 0.1 + 0.1 * progress,
+        },
+        {
+            "policy_kwargs": {
+                "net_arch": {"pi": [8], "vf": [9, 9]},
+                "share_features_extractor": False,
+            }
+        },
+        {
+            "policy_kwargs": {
+                "optimizer_class": th.optim.AdamW,
+                "optimizer_kwargs": {"weight_decay": 0.1},
+            }
+        },
+        {
+            "gramian_samples": 8,
+            "gramian_method": "passes",
+            "advantage_scope": "minibatch",
+            "kappa_max": 3.0,
+        },
     ],
 )
 def test_everything_comes_back(path: Path, kwargs: Any) -> None:
@@ -70,17 +89,22 @@ def test_everything_comes_back(path: Path, kwargs: Any) -> None:
     assert loaded.policy_kwargs == model.policy_kwargs
     assert "n_objectives" not in loaded.policy_kwargs
     assert loaded.rollout_buffer_class is None
-    np.testing.assert_array_equal(np.array(loaded.ep_component_buffer), np.array(model.ep_component_buffer))
+    np.testing.assert_array_equal(
+        np.array(loaded.ep_component_buffer), np.array(model.ep_component_buffer)
+    )
     observation = np.ones((5, 4), np.float32)
     np.testing.assert_array_equal(
-        model.predict(observation, deterministic=True)[0], loaded.predict(observation, deterministic=True)[0]
+        model.predict(observation, deterministic=True)[0],
+        loaded.predict(observation, deterministic=True)[0],
     )
     loaded.learn(96, reset_num_timesteps=False)
     assert th.isfinite(parameters(loaded)).all()
 
 
 def test_resuming_is_training_on(path: Path) -> None:
-    """train(2n) = train(n), save, load, train(n): same env object at an episode boundary, generators restored."""
+    """train(2n) = train(n), save, load, train(n): same env object at an episode boundary,
+    generators restored.
+    """
 
     def start() -> Any:
         # 16 divides n_steps: every rollout ends an episode in every env
@@ -98,13 +122,17 @@ def test_resuming_is_training_on(path: Path) -> None:
     assert resumed.num_timesteps == whole.num_timesteps == 256
     assert th.equal(parameters(resumed), parameters(whole))
     assert resumed._resolver_rng.bit_generator.state == whole._resolver_rng.bit_generator.state
-    np.testing.assert_array_equal(np.array(resumed.ep_component_buffer), np.array(whole.ep_component_buffer))
+    np.testing.assert_array_equal(
+        np.array(resumed.ep_component_buffer), np.array(whole.ep_component_buffer)
+    )
 
 
 def test_policies_save_and_load_alone(path: Path) -> None:
     for policy_class, observation in ((MlpPolicy, "Box"), (MultiInputPolicy, "Dict")):
         env = make_vec_env(lambda observation=observation: Env(observation=observation), 1)
-        model = GCRPPO(policy_class, env, policy_kwargs={"share_features_extractor": False}, **SMALL)
+        model = GCRPPO(
+            policy_class, env, policy_kwargs={"share_features_extractor": False}, **SMALL
+        )
         model.policy.save(path)
         loaded = policy_class.load(path)
         assert loaded.n_objectives == 3
@@ -114,7 +142,9 @@ def test_policies_save_and_load_alone(path: Path) -> None:
 
 
 def test_parameters_can_be_read_and_set() -> None:
-    model, other = (GCRPPO("MlpPolicy", make_vec_env(Env, 1), **{**SMALL, "seed": seed}) for seed in (0, 1))
+    model, other = (
+        GCRPPO("MlpPolicy", make_vec_env(Env, 1), **{**SMALL, "seed": seed}) for seed in (0, 1)
+    )
     model.learn(32)
     other.set_parameters(model.get_parameters())
     assert th.equal(parameters(model), parameters(other))
@@ -148,7 +178,8 @@ def test_other_levels_replace_the_models_with_a_warning(path: Path) -> None:
     GCRPPO("MlpPolicy", make_vec_env(Env, 1), **SMALL).save(path)
     levels = RewardSpec(SPEC.names, (0, 1, 2))
     message = (
-        "The env's levels replace those of the model: now go (task), stay (regulariser), save (level 2); "
+        "The env's levels replace those of the model: now go (task), stay (regulariser), save "
+        "(level 2); "
         "before go (task), stay (task), save (regulariser)."
     )
     with pytest.warns(UserWarning, match=exactly(message)):
@@ -162,7 +193,8 @@ def test_other_names_are_refused_with_both_lists(path: Path, how: str) -> None:
     model.save(path)
     other = DummyVecEnv([lambda: Env(RewardSpec(("go", "stay", "shine"), (0, 0, 1)))])
     message = (
-        "The env's reward components must be those of the model: the model has ['go', 'stay', 'save'], "
+        "The env's reward components must be those of the model: the model has ['go', 'stay', "
+        "'save'], "
         "found ['go', 'stay', 'shine'] in the env."
     )
     before = model.get_env()
@@ -178,8 +210,10 @@ def test_an_env_without_components_is_fine_for_predict_and_not_for_learn(path: P
     loaded = GCRPPO.load(path, plain)
     assert loaded.predict(plain.reset())[0].shape == (1, 2)
     message = (
-        "The env reports no reward components, but the model has 3: go (task), stay (task), save (regulariser). "
-        "Wrap it with `RewardDecomposition`, or set another with `set_env`; `predict` works without."
+        "The env reports no reward components, but the model has 3: go (task), stay (task), save "
+        "(regulariser). "
+        "Wrap it with `RewardDecomposition`, or set another with `set_env`; `predict` works "
+        "without."
     )
     with pytest.raises(ValueError, match=exactly(message)):
         loaded.learn(32)
@@ -200,7 +234,9 @@ def test_a_model_without_components_stays_one(path: Path) -> None:
 
 def test_arguments_can_be_changed_at_load(path: Path) -> None:
     GCRPPO("MlpPolicy", make_vec_env(Env, 1), **SMALL).learn(32).save(path)
-    loaded = GCRPPO.load(path, make_vec_env(Env, 1), resolver="guaranteed", n_steps=16, learning_rate=1e-5)
+    loaded = GCRPPO.load(
+        path, make_vec_env(Env, 1), resolver="guaranteed", n_steps=16, learning_rate=1e-5
+    )
     assert loaded.resolver == "guaranteed"
     loaded.learn(16)
     with pytest.raises(ValueError, match=r"^Parameter `resolver` must be one of"):

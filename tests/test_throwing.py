@@ -1,4 +1,6 @@
-"""The terms of Throwing-MO against numbers worked out by hand, its ball, its targets and its observation."""
+"""The terms of Throwing-MO against numbers worked out by hand, its ball, its targets and its
+observation.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +12,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 pytest.importorskip("mujoco.batch")
 
 from sb3_gcr import GCRPPO
-from sb3_gcr.envs import BatchedVecEnv, throwing
+from sb3_gcr.envs import BatchedVecEnv
 from sb3_gcr.envs.curriculum import DistanceCurriculum
 from sb3_gcr.envs.engine import Engine
-from sb3_gcr.envs.tasks import TASKS
+from sb3_gcr.envs.tasks import throwing
+from sb3_gcr.envs.tasks.catalogue import TASKS
 
 OBJECTIVES = ("energy", "baseh", "ballrel", "bodymo", "lftarm", "rgtarm")
 HOLD, OPEN = np.zeros((1, 24), np.float32), np.zeros((1, 24), np.float32)
@@ -31,7 +34,9 @@ def test_throwing_pays_once_for_what_is_left_of_1() -> None:
 def test_roll_is_free_below_a_tenth() -> None:
     """0.43 * 0.02 * 0.5 * (1 - e^-2) at 0.3 rad; both signs alike."""
     expected = -0.0086 * 0.5 * (1 - np.exp(-2))
-    np.testing.assert_allclose(throwing.roll(at(0.1, 0.3, -0.3)), [0, expected, expected], atol=1e-15)
+    np.testing.assert_allclose(
+        throwing.roll(at(0.1, 0.3, -0.3)), [0, expected, expected], atol=1e-15
+    )
     assert throwing.roll(at(0.0))[0] > 0
 
 
@@ -44,15 +49,21 @@ def test_stability_pays_a_standing_robot() -> None:
 
 
 def test_regularisers_grow_with_the_square() -> None:
-    np.testing.assert_allclose(throwing.action_rate_l2(np.array([[1.0, 2]]), np.array([[0.0, -1]])), [-2e-4])
+    np.testing.assert_allclose(
+        throwing.action_rate_l2(np.array([[1.0, 2]]), np.array([[0.0, -1]])), [-2e-4]
+    )
     np.testing.assert_allclose(throwing.dof_torques_l2(np.array([[30.0, 40]])), [-1.25e-4])
     np.testing.assert_allclose(throwing.dof_acc_l2(np.array([[300.0, 400]])), [-1.25e-4])
 
 
 def test_objectives_pay_each_step_or_at_release() -> None:
-    np.testing.assert_allclose(throwing.paid_each_step(at(0.49, 0.5, 0.55), (0.5, 0.55)), [0, 0.02, 0])
+    np.testing.assert_allclose(
+        throwing.paid_each_step(at(0.49, 0.5, 0.55), (0.5, 0.55)), [0, 0.02, 0]
+    )
     released = np.array([True, False, True])
-    np.testing.assert_allclose(throwing.paid_at_release(at(0.5, 0.5, 0.6), (0.5, 0.55), released), [1, 0, 0])
+    np.testing.assert_allclose(
+        throwing.paid_at_release(at(0.5, 0.5, 0.6), (0.5, 0.55), released), [1, 0, 0]
+    )
 
 
 def test_ranges_do_not_overlap() -> None:
@@ -64,14 +75,18 @@ def test_ranges_do_not_overlap() -> None:
 
 
 def test_closest_approach_of_a_ball_that_is_dropped_and_of_one_that_hits() -> None:
-    """Dropped from 1.03 m it lands after √(2/g); thrown level at 2 m/s it is 0.5 s later 1 m away and 1.226 m lower."""
+    """Dropped from 1.03 m it lands after √(2/g); thrown level at 2 m/s it is 0.5 s later 1 m away
+    and 1.226 m lower.
+    """
     ball = np.array([[0.0, 0, 1.03], [0, 0, 2.0]])
     velocity = np.array([[0.0, 0, 0], [2, 0, 0]])
     target = np.array([[0.3, 0, 0.03], [1.0, 0, 2 - 9.81 / 8]])
     distance, time = throwing.closest_approach(ball, velocity, target)
     np.testing.assert_allclose(distance, [0.3, 0], atol=0.01)
     np.testing.assert_allclose(time, [np.sqrt(2 / 9.81), 0.5], atol=0.01)
-    lying = throwing.closest_approach(np.array([[1.0, 1, 0.02]]), np.array([[3.0, 0, 0]]), np.array([[1.0, 1, 0.52]]))
+    lying = throwing.closest_approach(
+        np.array([[1.0, 1, 0.02]]), np.array([[3.0, 0, 0]]), np.array([[1.0, 1, 0.52]])
+    )
     np.testing.assert_allclose([lying[0][0], lying[1][0]], [0.5, 0])
 
 
@@ -93,7 +108,9 @@ def test_ball_stays_in_the_closed_hand_and_flies_from_the_open_one() -> None:
     assert rows.has_thrown[0] == 1
     assert thrown[-1].observations[0, 80] == 0
     assert rows.qpos[0, task._ball][2] < 0.1
-    expected = thrown[int(paid.argmax()) - 1].observations[0, 81]  # the score foreseen one step before
+    expected = thrown[int(paid.argmax()) - 1].observations[
+        0, 81
+    ]  # the score foreseen one step before
     assert paid.max() / 4.1 == pytest.approx(expected, abs=0.1)
 
 
@@ -128,7 +145,9 @@ def test_targets_lie_on_the_half_sphere() -> None:
     assert (targets[:, 2] >= 0).all()
     task.max_distance = 1
     np.testing.assert_allclose(np.linalg.norm(task.start(np.random.default_rng(0))["target"]), 1)
-    with pytest.raises(ValueError, match="Parameter `max_distance` must be between 1 and 5 m, found 7"):
+    with pytest.raises(
+        ValueError, match="Parameter `max_distance` must be between 1 and 5 m, found 7"
+    ):
         task.max_distance = 7
 
 
@@ -159,7 +178,11 @@ def test_time_limit_is_that_of_the_env() -> None:
 
 def test_wrong_range_is_refused() -> None:
     with pytest.raises(
-        ValueError, match=r"Parameter `rgtarm` must be None or the index of one of \{0: \(0.3, 0.5\), .* found 5"
+        ValueError,
+        match=(
+            r"Parameter `rgtarm` must be None or the index of one of \{0: \(0.3, 0.5\), .* found "
+            r"5"
+        ),
     ):
         throwing.ThrowingMO(rgtarm=5)
 
@@ -167,8 +190,13 @@ def test_wrong_range_is_refused() -> None:
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, BatchedVecEnv])
 def test_curriculum_moves_the_target_away(vec_env_cls: type[VecEnv]) -> None:
     env = make_vec_env("sb3_gcr/ThrowingMO-v0", 2, vec_env_cls=vec_env_cls)  # type: ignore[arg-type]
-    never, always = DistanceCurriculum(throwing=5), DistanceCurriculum(0.3, 1.5, throwing=-9, stability=-9)
-    model = GCRPPO("MlpPolicy", env, n_steps=101, batch_size=101, n_epochs=1, policy_kwargs={"net_arch": [8]})
+    never, always = (
+        DistanceCurriculum(throwing=5),
+        DistanceCurriculum(0.3, 1.5, throwing=-9, stability=-9),
+    )
+    model = GCRPPO(
+        "MlpPolicy", env, n_steps=101, batch_size=101, n_epochs=1, policy_kwargs={"net_arch": [8]}
+    )
     model.learn(202, callback=never)
     assert {task.max_distance for task in env.get_attr("task")} == {1}
     model.learn(3 * 202, callback=always)
@@ -182,7 +210,8 @@ def test_curriculum_refuses_what_it_cannot_do() -> None:
         DistanceCurriculum(increment=0)
     model = GCRPPO("MlpPolicy", "CartPole-v1", n_steps=64, batch_size=64)
     with pytest.raises(
-        ValueError, match="DistanceCurriculum needs the env 'sb3_gcr/ThrowingMO-v0', found one without targets"
+        ValueError,
+        match="DistanceCurriculum needs the env 'sb3_gcr/ThrowingMO-v0', found one without targets",
     ):
         model.learn(64, callback=DistanceCurriculum())
     model = GCRPPO("MlpPolicy", "sb3_gcr/HumanoidRun-v0", n_steps=64, batch_size=64)

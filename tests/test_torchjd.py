@@ -25,10 +25,16 @@ torchjd = pytest.importorskip("torchjd.aggregation")
     ids=["PCGrad", "UPGrad", "DualProj", "MGDA", "CAGrad"],
 )
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
-def test_published_torchjd_weights_at_any_scale(weighting: Any, expected: Any, scale: float) -> None:
-    """The values for scale 1 are TorchJD's published ones; the adapter must not lose them for small gradients."""
+def test_published_torchjd_weights_at_any_scale(
+    weighting: Any, expected: Any, scale: float
+) -> None:
+    """The values for scale 1 are TorchJD's published ones; the adapter must not lose them for small
+    gradients.
+    """
     jacobian = scale * TORCHJD_MATRIX
-    weights = from_torchjd(weighting())(jacobian @ jacobian.T, np.array([0, 1]), np.random.default_rng(0))
+    weights = from_torchjd(weighting())(
+        jacobian @ jacobian.T, np.array([0, 1]), np.random.default_rng(0)
+    )
     np.testing.assert_allclose(weights, expected, atol=1e-3 if scale != 1 else 4e-4)
 
 
@@ -46,9 +52,13 @@ def test_torchjd_adapter_keeps_the_preference_and_the_users_object() -> None:
 
 def test_torchjd_adapter_skips_a_zero_row_and_refuses_an_aggregator() -> None:
     jacobian = np.array([[1.0, 0.0], [0.0, 0.0], [-1.0, 1.0]])
-    weights = from_torchjd(torchjd.UPGradWeighting())(jacobian @ jacobian.T, np.zeros(3, int), np.random.default_rng(0))
+    weights = from_torchjd(torchjd.UPGradWeighting())(
+        jacobian @ jacobian.T, np.zeros(3, int), np.random.default_rng(0)
+    )
     assert weights[1] == 1
-    zeros = from_torchjd(torchjd.MGDAWeighting())(np.zeros((2, 2)), np.zeros(2, int), np.random.default_rng(0))
+    zeros = from_torchjd(torchjd.MGDAWeighting())(
+        np.zeros((2, 2)), np.zeros(2, int), np.random.default_rng(0)
+    )
     assert zeros.tolist() == [1, 1]
     message = (
         r"Parameter `weighting` must be a torchjd.aggregation.\*Weighting, found UPGrad. "

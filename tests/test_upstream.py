@@ -53,12 +53,15 @@ def fingerprint(function: Any) -> str:
     return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()[:12]
 
 
-@pytest.mark.parametrize(("owner", "name"), list(REVIEWED), ids=lambda value: getattr(value, "__name__", str(value)))
+@pytest.mark.parametrize(
+    ("owner", "name"), list(REVIEWED), ids=lambda value: getattr(value, "__name__", str(value))
+)
 def test_upstream_is_what_we_reviewed(owner: Any, name: str) -> None:
     function = evaluate_policy if owner is None else inspect.getattr_static(owner, name)
     function = getattr(function, "__func__", function)
     if fingerprint(function) != REVIEWED[owner, name]:
         pytest.fail(
-            f"SB3 has changed {getattr(owner, '__name__', '')}.{name}: review again what we override or rely on, then put "
+            f"SB3 has changed {getattr(owner, '__name__', '')}.{name}: review again what we "
+            "override or rely on, then put "
             f"{fingerprint(function)!r} into REVIEWED."
         )

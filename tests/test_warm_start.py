@@ -1,4 +1,6 @@
-"""A warm start keeps the actor, the critic's hidden layers and the value heads of the same name, and nothing else."""
+"""A warm start keeps the actor, the critic's hidden layers and the value heads of the same name,
+and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_gcr import GCRPPO, MlpPolicy, RewardSpec
-from sb3_gcr.warm_start import merge_parameters
+from sb3_gcr.saving.warm_start import merge_parameters
 from tests.envs import SPEC, Env
 
 SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 16, "n_epochs": 2, "seed": 0, "device": "cpu"}
@@ -39,21 +41,45 @@ def path(tmp_path: Path) -> Path:
 
 KINDS = [
     ("MlpPolicy", "Box", {}),
-    ("MlpPolicy", "Box", {"share_features_extractor": False, "net_arch": {"pi": [8], "vf": [9, 7]}, "activation_fn": nn.ELU}),
+    (
+        "MlpPolicy",
+        "Box",
+        {
+            "share_features_extractor": False,
+            "net_arch": {"pi": [8], "vf": [9, 7]},
+            "activation_fn": nn.ELU,
+        },
+    ),
     ("MultiInputPolicy", "Dict", {"net_arch": [8]}),
     ("MultiInputPolicy", "DictImage", {"share_features_extractor": False, "net_arch": [8]}),
     ("CnnPolicy", "ImageChannelsLast", {"features_extractor_kwargs": {"features_dim": 16}}),
-    ("CnnPolicy", "Image", {"features_extractor_kwargs": {"features_dim": 16}, "share_features_extractor": False}),
+    (
+        "CnnPolicy",
+        "Image",
+        {"features_extractor_kwargs": {"features_dim": 16}, "share_features_extractor": False},
+    ),
 ]
 
 
-@pytest.mark.parametrize(("algorithm", "weights_only"), [(PPO, False), (GCRPPO, False), (GCRPPO, True)])
+@pytest.mark.parametrize(
+    ("algorithm", "weights_only"), [(PPO, False), (GCRPPO, False), (GCRPPO, True)]
+)
 @pytest.mark.parametrize(("policy", "observation", "policy_kwargs"), KINDS)
 def test_kept_is_what_can_be_kept(
-    path: Path, algorithm: Any, weights_only: bool, policy: str, observation: str, policy_kwargs: Any
+    path: Path,
+    algorithm: Any,
+    weights_only: bool,
+    policy: str,
+    observation: str,
+    policy_kwargs: Any,
 ) -> None:
     old_env = make_vec_env(lambda: Env(observation=observation), 2, seed=0)
-    settings = {"policy_kwargs": policy_kwargs, "ent_coef": 0.01, "clip_range": 0.3, "learning_rate": 0.01}
+    settings = {
+        "policy_kwargs": policy_kwargs,
+        "ent_coef": 0.01,
+        "clip_range": 0.3,
+        "learning_rate": 0.01,
+    }
     old = algorithm(policy, old_env, **SMALL, **settings).learn(64)
     old.save(path)
     env = make_vec_env(lambda: Env(OTHER, observation=observation), 3, seed=1)
@@ -74,13 +100,22 @@ def test_kept_is_what_can_be_kept(
     np.testing.assert_array_equal(model.predict(observations, deterministic=True)[0], expected)
     untrained = GCRPPO(policy, env, **SMALL, policy_kwargs=policy_kwargs).policy.state_dict()
     is_ours = algorithm is GCRPPO
-    origins = [(before, 2), (untrained, 1), (before, 0)] if is_ours else [(untrained, k) for k in range(3)]
+    origins = (
+        [(before, 2), (untrained, 1), (before, 0)]
+        if is_ours
+        else [(untrained, k) for k in range(3)]
+    )
     for row, (origin, index) in enumerate(origins):
         for key in heads:
             assert th.equal(new[key][row], origin[key][index])
-    lists = "save, go; new: shine; left behind: stay" if is_ours else "none; new: save, shine, go; left behind: reward"
+    lists = (
+        "save, go; new: shine; left behind: stay"
+        if is_ours
+        else "none; new: save, shine, go; left behind: reward"
+    )
     assert model.warm_start_report == (
-        f"Warm start from {path}: actor and critic kept; value heads kept: {lists}; VecNormalize: no statistics in the file."
+        f"Warm start from {path}: actor and critic kept; value heads kept: {lists}; VecNormalize: "
+        "no statistics in the file."
     )
     assert model.learn(96).num_timesteps == 96
 
@@ -100,7 +135,9 @@ def test_kept_heads_predict_what_they_did(path: Path) -> None:
 def test_other_actions(path: Path, action: str) -> None:
     old = PPO("MlpPolicy", make_vec_env(lambda: Env(None, action=action), 1), **SMALL).learn(32)
     old.save(path)
-    model = GCRPPO.warm_start(path, make_vec_env(lambda: Env(action=action), 1), device="cpu").learn(32)
+    model = GCRPPO.warm_start(
+        path, make_vec_env(lambda: Env(action=action), 1), device="cpu"
+    ).learn(32)
     assert model.num_timesteps == 32
 
 
@@ -110,7 +147,9 @@ def test_gsde_and_its_deviations(path: Path) -> None:
     old.save(path)
     models = [
         GCRPPO.warm_start(path, make_vec_env(lambda: Env(OTHER), 1), device="cpu"),
-        GCRPPO.warm_start(path, make_vec_env(lambda: Env(OTHER), 1), device="cpu", weights_only=True),
+        GCRPPO.warm_start(
+            path, make_vec_env(lambda: Env(OTHER), 1), device="cpu", weights_only=True
+        ),
         GCRPPO.load(path, make_vec_env(Env, 1), device="cpu", weights_only=True),
     ]
     for model in models:
@@ -127,7 +166,8 @@ def test_from_one_objective_to_one(path: Path) -> None:
     model = GCRPPO.warm_start(path, env, device="cpu")
     assert all(map(th.equal, model.policy.parameters(), old.policy.parameters()))
     assert model.warm_start_report == (
-        f"Warm start from {path}: actor and critic kept; value heads kept: reward; new: none; left behind: none; "
+        f"Warm start from {path}: actor and critic kept; value heads kept: reward; new: none; left "
+        "behind: none; "
         "VecNormalize: no statistics in the file."
     )
     model.learn(32)
@@ -160,13 +200,19 @@ def test_the_report_is_logged_and_saved(path: Path, capsys: pytest.CaptureFixtur
     ("spec", "seen", "ending"),
     [
         (OTHER, False, "VecNormalize's statistics of observations and returns kept."),
-        (RewardSpec(("shine", "rain"), (0, 1)), False, "VecNormalize's statistics of observations kept."),
+        (
+            RewardSpec(("shine", "rain"), (0, 1)),
+            False,
+            "VecNormalize's statistics of observations kept.",
+        ),
         (OTHER, True, "VecNormalize keeps its own statistics."),
         (OTHER, None, "VecNormalize: none, though the file has statistics."),
     ],
 )
 @pytest.mark.parametrize("weights_only", [False, True])
-def test_statistics(path: Path, spec: RewardSpec, seen: bool | None, ending: str, weights_only: bool) -> None:
+def test_statistics(
+    path: Path, spec: RewardSpec, seen: bool | None, ending: str, weights_only: bool
+) -> None:
     old_env = VecNormalize(make_vec_env(Env, 2, seed=0))
     GCRPPO("MlpPolicy", old_env, **SMALL).learn(64).save(path)
     env: Any = make_vec_env(lambda: Env(spec), 2, seed=1)
@@ -189,9 +235,12 @@ def test_another_critic_begins_anew(path: Path) -> None:
     old = GCRPPO("MlpPolicy", make_vec_env(Env, 1), **SMALL).learn(32)
     old.save(path)
     larger = {"net_arch": {"pi": [64, 64], "vf": [128]}}
-    model = GCRPPO.warm_start(path, make_vec_env(lambda: Env(OTHER), 1), device="cpu", policy_kwargs=larger)
+    model = GCRPPO.warm_start(
+        path, make_vec_env(lambda: Env(OTHER), 1), device="cpu", policy_kwargs=larger
+    )
     assert model.warm_start_report == (
-        f"Warm start from {path}: actor kept, critic new (its layers differ); value heads kept: none; new: save, shine, go; "
+        f"Warm start from {path}: actor kept, critic new (its layers differ); value heads kept: "
+        "none; new: save, shine, go; "
         "left behind: go, stay, save; VecNormalize: no statistics in the file."
     )
     assert th.equal(model.policy.action_net.weight, old.policy.action_net.weight)
@@ -201,24 +250,40 @@ def test_another_critic_begins_anew(path: Path) -> None:
 def test_another_actor_is_refused(path: Path) -> None:
     GCRPPO("MlpPolicy", make_vec_env(Env, 1), policy_kwargs={"net_arch": [8]}, **SMALL).save(path)
     message = (
-        "Parameter `policy_kwargs` must leave the actor as it was, found other layers: mlp_extractor.policy_net.0.weight is "
-        "(8, 4) in the file and (9, 4) in the new model; mlp_extractor.policy_net.0.bias is (8,) in the file and (9,) in the "
+        "Parameter `policy_kwargs` must leave the actor as it was, found other layers: "
+        "mlp_extractor.policy_net.0.weight is "
+        "(8, 4) in the file and (9, 4) in the new model; mlp_extractor.policy_net.0.bias is (8,) "
+        "in the file and (9,) in the "
         "new model; action_net.weight is (2, 8) in the file and (2, 9) in the new model."
     )
     with pytest.raises(ValueError, match=exactly(message)):
-        GCRPPO.warm_start(path, make_vec_env(Env, 1), policy_kwargs={"net_arch": {"pi": [9], "vf": [8]}})
+        GCRPPO.warm_start(
+            path, make_vec_env(Env, 1), policy_kwargs={"net_arch": {"pi": [9], "vf": [8]}}
+        )
 
 
 def test_sharing_or_not_the_actor_keeps_its_features() -> None:
-    """A critic that had features of its own gives them up; one that shared them begins with a copy."""
+    """A critic that had features of its own gives them up; one that shared them begins with a
+    copy.
+    """
 
     def network(offset: float, shared: bool) -> dict[str, th.Tensor]:
         names = ("features_extractor.w", "pi_features_extractor.w", "vf_features_extractor.w")
-        features = {name: th.full((2, 2), offset + (2 if name.startswith("vf") and not shared else 1)) for name in names}
-        return {**features, "action_net.w": th.ones(1), "value_net.weight": th.ones(1, 2), "value_net.bias": th.ones(1)}
+        features = {
+            name: th.full((2, 2), offset + (2 if name.startswith("vf") and not shared else 1))
+            for name in names
+        }
+        return {
+            **features,
+            "action_net.w": th.ones(1),
+            "value_net.weight": th.ones(1, 2),
+            "value_net.bias": th.ones(1),
+        }
 
     for shared in (True, False):
-        merged, kept = merge_parameters(network(10, shared), network(20, not shared), ["a"], ["a"], shared)
+        merged, kept = merge_parameters(
+            network(10, shared), network(20, not shared), ["a"], ["a"], shared
+        )
         assert kept.critic
         for name in ("features_extractor.w", "pi_features_extractor.w", "vf_features_extractor.w"):
             assert (merged[name] == 21).all()
@@ -234,8 +299,16 @@ def test_a_policy_of_your_own(path: Path) -> None:
         pass
 
     GCRPPO(Policy, make_vec_env(Env, 1), **SMALL).save(path)
-    assert GCRPPO.warm_start(path, make_vec_env(lambda: Env(OTHER), 1), device="cpu").policy_class.__name__ == "Policy"
-    assert GCRPPO.warm_start(path, make_vec_env(Env, 1), device="cpu", policy="MlpPolicy").policy_class is MlpPolicy
+    assert (
+        GCRPPO.warm_start(
+            path, make_vec_env(lambda: Env(OTHER), 1), device="cpu"
+        ).policy_class.__name__
+        == "Policy"
+    )
+    assert (
+        GCRPPO.warm_start(path, make_vec_env(Env, 1), device="cpu", policy="MlpPolicy").policy_class
+        is MlpPolicy
+    )
 
 
 # === What does not fit ===
@@ -244,15 +317,24 @@ def test_a_policy_of_your_own(path: Path) -> None:
 @pytest.mark.parametrize(
     ("observation", "action", "differences"),
     [
-        ("Discrete", "Box", "observation_space.type is 'Dict' in the file and 'Discrete' in the env"),
+        (
+            "Discrete",
+            "Box",
+            "observation_space.type is 'Dict' in the file and 'Discrete' in the env",
+        ),
         (
             "DictImage",
             "Box",
-            "observation_space.spaces.b is {'n': 4, 'start': 0, 'type': 'Discrete'} in the file and 'missing' in the env; "
+            "observation_space.spaces.b is {'n': 4, 'start': 0, 'type': 'Discrete'} in the file "
+            "and 'missing' in the env; "
             "observation_space.spaces.i is 'missing' in the file and "
             "{'dtype': 'uint8', 'high': 255.0, 'low': 0.0, 'shape': [1, 36, 36], ...} in the env",
         ),
-        ("Dict", "MultiBinary", "action_space.type is 'Box' in the file and 'MultiBinary' in the env"),
+        (
+            "Dict",
+            "MultiBinary",
+            "action_space.type is 'Box' in the file and 'MultiBinary' in the env",
+        ),
         (
             "Box",
             "Discrete",
@@ -261,10 +343,14 @@ def test_a_policy_of_your_own(path: Path) -> None:
         ),
     ],
 )
-def test_other_spaces_are_refused_with_what_differs(path: Path, observation: str, action: str, differences: str) -> None:
+def test_other_spaces_are_refused_with_what_differs(
+    path: Path, observation: str, action: str, differences: str
+) -> None:
     GCRPPO("MultiInputPolicy", make_vec_env(lambda: Env(observation="Dict"), 1), **SMALL).save(path)
     env = make_vec_env(lambda: Env(observation=observation, action=action), 1)
-    message = f"Parameter `env` must have the spaces of the saved model, found others: {differences}."
+    message = (
+        f"Parameter `env` must have the spaces of the saved model, found others: {differences}."
+    )
     for weights_only in (False, True):
         with pytest.raises(ValueError, match=exactly(message)):
             GCRPPO.warm_start(path, env, weights_only=weights_only)
@@ -273,8 +359,10 @@ def test_other_spaces_are_refused_with_what_differs(path: Path, observation: str
 def test_other_sizes_and_bounds_are_named(path: Path) -> None:
     GCRPPO("MlpPolicy", "Reacher-v5", **SMALL).save(path)
     message = (
-        "Parameter `env` must have the spaces of the saved model, found others: observation_space.shape is [10] in the file "
-        "and [23] in the env; action_space.shape is [2] in the file and [7] in the env; action_space.low is -1.0 in the file "
+        "Parameter `env` must have the spaces of the saved model, found others: "
+        "observation_space.shape is [10] in the file "
+        "and [23] in the env; action_space.shape is [2] in the file and [7] in the env; "
+        "action_space.low is -1.0 in the file "
         "and -2.0 in the env; action_space.high is 1.0 in the file and 2.0 in the env."
     )
     with pytest.raises(ValueError, match=exactly(message)):
@@ -283,10 +371,14 @@ def test_other_sizes_and_bounds_are_named(path: Path) -> None:
 
 def test_other_algorithms_are_refused(path: Path) -> None:
     env = make_vec_env(lambda: Env(None), 1)
-    for model in (SAC("MlpPolicy", env, buffer_size=8, device="cpu"), A2C("MlpPolicy", env, device="cpu")):
+    for model in (
+        SAC("MlpPolicy", env, buffer_size=8, device="cpu"),
+        A2C("MlpPolicy", env, device="cpu"),
+    ):
         model.save(path)
         message = (
-            f"Parameter `path` must be the file of a PPO or a GCRPPO, found another's, with policy {model.policy_class!r}."
+            "Parameter `path` must be the file of a PPO or a GCRPPO, found another's, with "
+            f"policy {model.policy_class!r}."
         )
         with pytest.raises(ValueError, match=exactly(message)):
             GCRPPO.warm_start(path, make_vec_env(Env, 1))
@@ -296,8 +388,16 @@ def test_names_decide(path: Path) -> None:
     """Even where the number of components is the same."""
     GCRPPO("MlpPolicy", make_vec_env(Env, 1), **SMALL).save(path)
     same = GCRPPO.warm_start(path, make_vec_env(Env, 1), device="cpu")
-    others = GCRPPO.warm_start(path, make_vec_env(lambda: Env(RewardSpec(("a", "b", "c"), (0, 0, 1))), 1), device="cpu")
+    others = GCRPPO.warm_start(
+        path, make_vec_env(lambda: Env(RewardSpec(("a", "b", "c"), (0, 0, 1))), 1), device="cpu"
+    )
     assert same.warm_start_report is not None
     assert others.warm_start_report is not None
-    assert f"value heads kept: {', '.join(SPEC.names)}; new: none; left behind: none;" in same.warm_start_report
-    assert "value heads kept: none; new: a, b, c; left behind: go, stay, save;" in others.warm_start_report
+    assert (
+        f"value heads kept: {', '.join(SPEC.names)}; new: none; left behind: none;"
+        in same.warm_start_report
+    )
+    assert (
+        "value heads kept: none; new: a, b, c; left behind: go, stay, save;"
+        in others.warm_start_report
+    )

@@ -1,4 +1,6 @@
-"""rl-zoo3's commands, end to end with tiny budgets, and a model from every entry of our YAML files."""
+"""rl-zoo3's commands, end to end with tiny budgets, and a model from every entry of our YAML
+files.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +23,17 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_gcr import GCRPPO, zoo
-from sb3_gcr.components import GYMNASIUM_ENVS
-from sb3_gcr.envs.envpool import ENVPOOL_ENVS
-from sb3_gcr.envs.envpool_gym import pool_of
-from sb3_gcr.envs.tasks import TASKS
+from sb3_gcr import GCRPPO
+from sb3_gcr.envs.tasks.catalogue import TASKS
+from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS
+from sb3_gcr.simulators.envpool import ENVPOOL_ENVS
+from sb3_gcr.simulators.envpool_gym import pool_of
+from sb3_gcr.zoo import commands as zoo
 from sb3_gcr.zoo import main
 
-if importlib.util.find_spec("rl_zoo3") is None:  # importing it here would change Gymnasium for the tests of other files
+if (
+    importlib.util.find_spec("rl_zoo3") is None
+):  # importing it here would change Gymnasium for the tests of other files
     pytest.skip("needs rl_zoo3", allow_module_level=True)
 HAS_TASKS = importlib.util.find_spec("mujoco.batch") is not None
 if HAS_TASKS:
@@ -37,14 +42,20 @@ pytestmark = [
     pytest.mark.filterwarnings(f"ignore:{message}")
     for message in (
         "FigureCanvasAgg is non-interactive",  # its plots call plt.show()
-        "No artists with labels found",  # and plt.legend() where no run has a whole window of episodes
-        "You have specified a mini-batch size",  # its sampler draws n_steps and batch_size apart from each other
+        # and plt.legend() where no run has a whole window of episodes
+        "No artists with labels found",
+        # its sampler draws n_steps and batch_size apart from each other
+        "You have specified a mini-batch size",
         "Argument ``multivariate`` is an experimental feature",  # of Optuna, which it uses
-        "`GridSampler` is re-evaluating",  # Optuna, at the start of a search that is already complete
+        # Optuna, at the start of a search that is already complete
+        "`GridSampler` is re-evaluating",
     )
 ]
 
-FILES = {algo: yaml.safe_load((files("sb3_gcr.hyperparams") / f"{algo}.yml").read_text()) for algo in ("gcrppo", "ppo")}
+FILES = {
+    algo: yaml.safe_load((files("sb3_gcr.hyperparams") / f"{algo}.yml").read_text())
+    for algo in ("gcrppo", "ppo")
+}
 RUN = "sb3_gcr/HumanoidRun-v0"
 #: One update of 64 steps in place of 512.
 SMALL = ["--seed", "0", "-params", "n_steps:64", "batch_size:32", "n_epochs:1"]
@@ -75,17 +86,25 @@ def test_files_have_every_env_and_differ_only_where_they_must() -> None:
     ours |= {f"envpool/{env_id}" for env_id in ENVPOOL_ENVS}
     assert set(FILES["gcrppo"]) == set(FILES["ppo"]) == set(GYMNASIUM_ENVS) | ours
     for env_id, settings in FILES["gcrppo"].items():
-        only_ours = {"env_wrapper", "desired_kl"} | ({"ent_coef"} if "Throwing" in env_id else set())
+        only_ours = {"env_wrapper", "desired_kl"} | (
+            {"ent_coef"} if "Throwing" in env_id else set()
+        )
         assert {key: value for key, value in settings.items() if key not in only_ours} == {
-            key: value for key, value in FILES["ppo"][env_id].items() if key != "ent_coef" or "ent_coef" not in only_ours
+            key: value
+            for key, value in FILES["ppo"][env_id].items()
+            if key != "ent_coef" or "ent_coef" not in only_ours
         }
-        assert settings.get("env_wrapper") == (None if env_id in ours else "sb3_gcr.RewardDecomposition")
+        assert settings.get("env_wrapper") == (
+            None if env_id in ours else "sb3_gcr.RewardDecomposition"
+        )
     assert zoo.hyperparameter_file("ppo", "Humanoid-v5")
     assert not zoo.hyperparameter_file("ppo", "CartPole-v1")
     assert not zoo.hyperparameter_file("sac", "Humanoid-v5")
 
 
-@pytest.mark.parametrize(("algo", "env_id"), [(algo, env_id) for algo, entries in FILES.items() for env_id in entries])
+@pytest.mark.parametrize(
+    ("algo", "env_id"), [(algo, env_id) for algo, entries in FILES.items() for env_id in entries]
+)
 def test_every_entry_makes_a_model(algo: str, env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """And warns of nothing, such as a minibatch that does not divide the rollout."""
     if env_id not in gym.registry:
@@ -96,8 +115,14 @@ def test_every_entry_makes_a_model(algo: str, env_id: str, monkeypatch: pytest.M
         pytest.importorskip("envpool")
         monkeypatch.setattr(manager_class, "default_vec_env_cls", staticmethod(pool_of))
     if env_id.startswith("sb3_gcr/"):
-        monkeypatch.setattr(manager_class, "default_vec_env_cls", pytest.importorskip("sb3_gcr.envs.batched").BatchedVecEnv)
-    manager = manager_class(argparse.Namespace(), algo, env_id, "logs", eval_freq=-1, verbose=0, device="cpu")
+        monkeypatch.setattr(
+            manager_class,
+            "default_vec_env_cls",
+            pytest.importorskip("sb3_gcr.envs.batched").BatchedVecEnv,
+        )
+    manager = manager_class(
+        argparse.Namespace(), algo, env_id, "logs", eval_freq=-1, verbose=0, device="cpu"
+    )
     model, _ = manager.setup_experiment()  # type: ignore[misc]
     entry = FILES[algo][env_id]
     assert type(model) is {"gcrppo": GCRPPO, "ppo": PPO}[algo]
@@ -106,7 +131,9 @@ def test_every_entry_makes_a_model(algo: str, env_id: str, monkeypatch: pytest.M
     assert isinstance(model, PPO)
     assert model.n_steps * model.n_envs % model.batch_size == 0
     if algo == "gcrppo":
-        assert getattr(model, "n_objectives") == (1 if env_id == "InvertedPendulum-v5" else max(2, model.n_objectives))  # type: ignore[attr-defined]  # noqa: B009
+        assert model.n_objectives == (
+            1 if env_id == "InvertedPendulum-v5" else max(2, model.n_objectives)
+        )  # type: ignore[attr-defined]
         assert getattr(model, "desired_kl") == entry.get("desired_kl")  # noqa: B009
     model.env.close()
 
@@ -125,15 +152,28 @@ def test_train_stop_resume_enjoy_and_plot(
             raise KeyboardInterrupt
         update(model)
 
-    frequencies = ["--eval-freq", "64", "--eval-episodes", "2", "--save-freq", "64", "--tensorboard-log", "tb"]
+    frequencies = [
+        "--eval-freq",
+        "64",
+        "--eval-episodes",
+        "2",
+        "--save-freq",
+        "64",
+        "--tensorboard-log",
+        "tb",
+    ]
     with monkeypatch.context() as stop:
         stop.setattr(PPO if algo == "ppo" else GCRPPO, "train", interrupt)
         train(algo, "Hopper-v5", "-n", "100000", *frequencies, *SMALL)
     run = Path(f"logs/{algo}/Hopper-v5_1")
     names = {path.name for path in run.iterdir()}
-    assert names == {"0.monitor.csv", "Hopper-v5", "Hopper-v5.zip", "best_model.zip", "evaluations.npz"} | {
-        f"rl_model_{n}_steps.zip" for n in (64, 128)
-    }
+    assert names == {
+        "0.monitor.csv",
+        "Hopper-v5",
+        "Hopper-v5.zip",
+        "best_model.zip",
+        "evaluations.npz",
+    } | {f"rl_model_{n}_steps.zip" for n in (64, 128)}
     assert {path.name for path in (run / "Hopper-v5").iterdir()} == {
         "args.yml",
         "command.txt",
@@ -149,16 +189,49 @@ def test_train_stop_resume_enjoy_and_plot(
     assert out.count("Loading saved VecNormalize stats") == 2  # of training and evaluation
     assert "Loading pretrained agent" in out
     counts = [
-        VecNormalize.load(f"logs/{algo}/Hopper-v5_{i}/Hopper-v5/vecnormalize.pkl", _venv()).obs_rms.count for i in (1, 2)
+        VecNormalize.load(
+            f"logs/{algo}/Hopper-v5_{i}/Hopper-v5/vecnormalize.pkl", _venv()
+        ).obs_rms.count
+        for i in (1, 2)
     ]
-    assert counts[1] == pytest.approx(counts[0] + 129, abs=1)  # both started from what the first run has seen
+    assert counts[1] == pytest.approx(
+        counts[0] + 129, abs=1
+    )  # both started from what the first run has seen
 
     for chosen in ([], ["--load-best"], ["--load-checkpoint", "64"], ["--load-last-checkpoint"]):
-        main(["enjoy", "--algo", algo, "--env", "Hopper-v5", "-f", "logs", "-n", "60", "--no-render", *chosen])
+        main(
+            [
+                "enjoy",
+                "--algo",
+                algo,
+                "--env",
+                "Hopper-v5",
+                "-f",
+                "logs",
+                "-n",
+                "60",
+                "--no-render",
+                *chosen,
+            ]
+        )
         assert "Loading running average" in capsys.readouterr().out
 
     main(["plot_train", "-a", algo, "-e", "Hopper-v5", "-f", "logs", "-w", "1"])
-    main(["all_plots", "-a", algo, "-e", "Hopper-v5", "-f", "logs", "--no-million", "-o", "results", "--no-display"])
+    main(
+        [
+            "all_plots",
+            "-a",
+            algo,
+            "-e",
+            "Hopper-v5",
+            "-f",
+            "logs",
+            "--no-million",
+            "-o",
+            "results",
+            "--no-display",
+        ]
+    )
     main(["plot_from_file", "-i", "results", "-o", "picture.svg", "--no-million"])
     assert Path("picture.svg").stat().st_size > 0
 
@@ -194,14 +267,33 @@ def test_batched_envs_train_evaluate_and_play(capsys: pytest.CaptureFixture[str]
 def test_envpools_envs_train_and_play(capsys: pytest.CaptureFixture[str]) -> None:
     """In one pool, with the terms in Monitor's file; the model is played in one env."""
     pytest.importorskip("envpool")
-    env_id, small = "envpool/Reacher-v5", ["-params", "n_envs:8", "n_steps:64", "batch_size:128", "n_epochs:1"]
+    env_id, small = (
+        "envpool/Reacher-v5",
+        ["-params", "n_envs:8", "n_steps:64", "batch_size:128", "n_epochs:1"],
+    )
     train("gcrppo", env_id, "--vec-env", "batch", "-n", "512", "--eval-freq", "-1", *small)
     folder = Path("logs/gcrppo/envpool-Reacher-v5_1")
     episodes = load_results(str(folder))
     assert len(episodes) >= 8
-    np.testing.assert_allclose(episodes["r_reward_dist"] + episodes["r_reward_ctrl"], episodes["r"], atol=1e-4)
+    np.testing.assert_allclose(
+        episodes["r_reward_dist"] + episodes["r_reward_ctrl"], episodes["r"], atol=1e-4
+    )
     for vec_env in ([], ["--vec-env", "batch"]):
-        main(["enjoy", "--algo", "gcrppo", "--env", env_id, "-f", "logs", "-n", "60", "--no-render", *vec_env])
+        main(
+            [
+                "enjoy",
+                "--algo",
+                "gcrppo",
+                "--env",
+                env_id,
+                "-f",
+                "logs",
+                "-n",
+                "60",
+                "--no-render",
+                *vec_env,
+            ]
+        )
         assert "Episode Reward" in capsys.readouterr().out
 
 
@@ -217,11 +309,36 @@ def test_record_training_records_our_runs(tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin/ffmpeg").symlink_to(ffmpeg)
-    train("gcrppo", "sb3_gcr/Hopper-v0", "-n", "64", "--eval-freq", "-1", *SMALL, "n_envs:2", "--vec-env", "batch")
-    options = ["--algo", "gcrppo", "--env", "sb3_gcr/Hopper-v0", "-f", "logs", "-n", "5", "--vec-env", "batch"]
+    train(
+        "gcrppo",
+        "sb3_gcr/Hopper-v0",
+        "-n",
+        "64",
+        "--eval-freq",
+        "-1",
+        *SMALL,
+        "n_envs:2",
+        "--vec-env",
+        "batch",
+    )
+    options = [
+        "--algo",
+        "gcrppo",
+        "--env",
+        "sb3_gcr/Hopper-v0",
+        "-f",
+        "logs",
+        "-n",
+        "5",
+        "--vec-env",
+        "batch",
+    ]
     environment = {**os.environ, "MUJOCO_GL": "egl", "PATH": f"{tmp_path}/bin:{os.environ['PATH']}"}
     result = subprocess.run(
-        [sys.executable, "-m", "sb3_gcr.zoo", "record_training", *options], capture_output=True, text=True, env=environment
+        [sys.executable, "-m", "sb3_gcr.zoo", "record_training", *options],
+        capture_output=True,
+        text=True,
+        env=environment,
     )
     if "OpenGL context" in result.stderr or "EGL" in result.stderr:
         pytest.skip("no EGL here")
@@ -232,8 +349,27 @@ def test_record_training_records_our_runs(tmp_path: Path) -> None:
 
 
 def test_optimize_searches_the_resolver_too(capsys: pytest.CaptureFixture[str]) -> None:
-    search = ["--storage", "search.log", "--study-name", "s", "--n-trials", "2", "--eval-episodes", "1", "-n", "200"]
-    train("gcrppo", "Swimmer-v5", "-optimize", *search, "--env-kwargs", "max_episode_steps:20", "--no-optim-plots")
+    search = [
+        "--storage",
+        "search.log",
+        "--study-name",
+        "s",
+        "--n-trials",
+        "2",
+        "--eval-episodes",
+        "1",
+        "-n",
+        "200",
+    ]
+    train(
+        "gcrppo",
+        "Swimmer-v5",
+        "-optimize",
+        *search,
+        "--env-kwargs",
+        "max_episode_steps:20",
+        "--no-optim-plots",
+    )
     report = next(Path("logs/gcrppo").glob("report_*.csv"))
     rows = list(csv.DictReader(report.read_text().splitlines()))
     assert len(rows) == 2
@@ -255,7 +391,9 @@ def test_optimize_searches_the_resolver_too(capsys: pytest.CaptureFixture[str]) 
     assert f"('resolver', '{rows[1]['params_resolver']}')" in capsys.readouterr().out
 
 
-def test_tune_entropy_gives_every_value_all_seeds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tune_entropy_gives_every_value_all_seeds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert np.round(zoo.ENTROPY_GRID["ent_coef"], 8).tolist() == [
         *(0.0001, 0.00018847, 0.0003552, 0.00066943, 0.00126166),  # the numbers of the paper
         *(0.00237782, 0.0044814, 0.00844598, 0.01591789, 0.03),
@@ -292,8 +430,20 @@ def test_tune_entropy_gives_every_value_all_seeds(monkeypatch: pytest.MonkeyPatc
     assert capsys.readouterr().out.splitlines()[-4:] == table
 
 
-def test_envs_that_we_have_no_settings_for_get_those_of_rl_zoo3(capsys: pytest.CaptureFixture[str]) -> None:
-    small = ["-n", "10", "--eval-freq", "-1", "-params", "n_envs:1", "n_steps:8", "batch_size:8", "n_epochs:1"]
+def test_envs_that_we_have_no_settings_for_get_those_of_rl_zoo3(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    small = [
+        "-n",
+        "10",
+        "--eval-freq",
+        "-1",
+        "-params",
+        "n_envs:1",
+        "n_steps:8",
+        "batch_size:8",
+        "n_epochs:1",
+    ]
     for algo in ("gcrppo", "ppo"):
         train(algo, "CartPole-v1", *small)
         assert "rl_zoo3/hyperparams/ppo.yml" in capsys.readouterr().out.replace(os.sep, "/")
@@ -340,9 +490,18 @@ def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
             ["train", "--vec-env", "batch", "--env", "Ant-v5"],
             "--vec-env batch needs an env of sb3_gcr or EnvPool, such as '" + RUN,
         ),
-        (["enjoy", "--vec-env", "x"], "sb3-gcr-zoo enjoy: error: argument --vec-env: invalid choice: 'x' (choose from"),
-        (["train", "--algo", "x"], "sb3-gcr-zoo train: error: argument --algo: invalid choice: 'x' (choose from"),
-        (["tune_entropy", "--algo", "ppo"], "sb3-gcr-zoo tune_entropy: error: the following arguments are required: --env"),
+        (
+            ["enjoy", "--vec-env", "x"],
+            "sb3-gcr-zoo enjoy: error: argument --vec-env: invalid choice: 'x' (choose from",
+        ),
+        (
+            ["train", "--algo", "x"],
+            "sb3-gcr-zoo train: error: argument --algo: invalid choice: 'x' (choose from",
+        ),
+        (
+            ["tune_entropy", "--algo", "ppo"],
+            "sb3-gcr-zoo tune_entropy: error: the following arguments are required: --env",
+        ),
         (["tune_entropy", "--n-jobs", "2"], "argument --n-jobs: invalid choice: 2 (choose from"),
     ],
 )
@@ -358,18 +517,23 @@ def test_errors(arguments: list[str], message: str, capsys: pytest.CaptureFixtur
     assert sys.argv is before
 
 
-def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_missing_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     with monkeypatch.context() as without:
         without.setenv("PATH", "")
         with pytest.raises(SystemExit):
             main(["record_training"])
     assert capsys.readouterr().err == (
-        "sb3-gcr-zoo record_training needs the program ffmpeg; on Debian and Ubuntu: apt install ffmpeg\n"
+        "sb3-gcr-zoo record_training needs the program ffmpeg; on Debian and Ubuntu: apt install "
+        "ffmpeg\n"
     )
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
     with pytest.raises(SystemExit) as stop:
         main(["train"])
     assert stop.value.code == 2
-    assert capsys.readouterr().err.startswith("sb3-gcr-zoo needs rl-zoo3: pip install 'sb3_gcr[zoo]' (")
+    assert capsys.readouterr().err.startswith(
+        "sb3-gcr-zoo needs rl-zoo3: pip install 'sb3_gcr[zoo]' ("
+    )
     with pytest.raises(ImportError, match=r"needs rl-zoo3: pip install 'sb3_gcr\[zoo\]'"):
         zoo.register()

@@ -12,7 +12,15 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_gcr import GCRPPO, RESOLVERS, MlpPolicy, RewardDecomposition, RewardSpec, evaluate_components, latest_checkpoint
+from sb3_gcr import (
+    GCRPPO,
+    RESOLVERS,
+    MlpPolicy,
+    RewardDecomposition,
+    RewardSpec,
+    evaluate_components,
+    latest_checkpoint,
+)
 
 
 class Robot(GCRPPO):
@@ -29,7 +37,10 @@ class StopWhenTired(BaseCallback):
 
 
 def halve_regularisers(
-    gramian: NDArray[np.float64], levels: NDArray[np.integer[Any]], rng: np.random.Generator, factor: float = 0.5
+    gramian: NDArray[np.float64],
+    levels: NDArray[np.integer[Any]],
+    rng: np.random.Generator,
+    factor: float = 0.5,
 ) -> NDArray[np.float64]:
     return np.where(levels > 0, factor, 1.0)
 
@@ -41,7 +52,13 @@ def make_env(n_envs: int = 2) -> VecEnv:
 
 def train(folder: Path, schedule: Callable[[float], float]) -> Robot:
     checkpoint: Path | None = latest_checkpoint(folder)
-    model = Robot(MlpPolicy, make_env(), schedule, resolver=halve_regularisers, resolver_kwargs={"factor": 0.1})
+    model = Robot(
+        MlpPolicy,
+        make_env(),
+        schedule,
+        resolver=halve_regularisers,
+        resolver_kwargs={"factor": 0.1},
+    )
     if checkpoint is not None:
         model = Robot.load(checkpoint, env=make_env())
     model = model.learn(2000, callback=[StopWhenTired(), CheckpointCallback(100, str(folder))])
@@ -51,7 +68,9 @@ def train(folder: Path, schedule: Callable[[float], float]) -> Robot:
 
 def finish(folder: Path) -> dict[str, int]:
     spec = RewardSpec.from_dict({"run": "task", "effort": "regulariser", "noise": 2})
-    safe = GCRPPO.load(str(folder / "model"), env=make_env(), device="cpu", weights_only=True, resolver="sum")
+    safe = GCRPPO.load(
+        str(folder / "model"), env=make_env(), device="cpu", weights_only=True, resolver="sum"
+    )
     model = Robot.warm_start(folder / "model", make_env(), ent_coef=0.01)
     report: str | None = model.warm_start_report
     greeting: str = model.greet()

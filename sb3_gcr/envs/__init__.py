@@ -1,7 +1,9 @@
-"""Tasks with a reward of named terms, one simulation at a time or hundreds of them on a thread pool.
+"""Tasks with a reward of named terms, one simulation at a time or hundreds of them on a thread
+pool.
 
-Read ``task`` (what a task is), then one of them (``humanoid``), ``engine`` (who steps it), and the three ways to use it:
-``single`` (a Gymnasium env), ``batched`` (a VecEnv of Stable-Baselines3) and ``vector`` (a vector env of Gymnasium).
+Read ``task`` (what a task is), then one of them (``humanoid``), ``engine`` (who steps it), and the
+three ways to use it: ``single`` (a Gymnasium env), ``batched`` (a VecEnv of Stable-Baselines3) and
+``vector`` (a vector env of Gymnasium).
 """
 
 from __future__ import annotations
@@ -11,10 +13,10 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_gcr.envs.envpool_gym import register_pools
-from sb3_gcr.envs.tasks import TASKS
+from sb3_gcr.envs.tasks.catalogue import TASKS
+from sb3_gcr.simulators.envpool_gym import register_pools
 
-_VEC_ENVS = {"BatchedVecEnv": "sb3_gcr.envs.batched", "EnvPoolVecEnv": "sb3_gcr.envs.envpool"}
+_VEC_ENVS = {"BatchedVecEnv": "sb3_gcr.envs.batched", "EnvPoolVecEnv": "sb3_gcr.simulators.envpool"}
 
 
 def register_envs() -> None:
@@ -38,7 +40,8 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
         return getattr(import_module(_VEC_ENVS[name]), name)
-    except AttributeError as error:  # MuJoCo, where the library behind MUJOCO_GL is missing; a name lookup would swallow it
+    # MuJoCo, where the library behind MUJOCO_GL is missing; a name lookup would swallow it
+    except AttributeError as error:
         raise ImportError(f"{name} could not be imported: {error}") from error
 
 

@@ -14,25 +14,28 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from sb3_gcr.components import COMPONENTS_KEY
 from sb3_gcr.envs.engine import Engine
 from sb3_gcr.envs.single import Painter, TaskEnv
+from sb3_gcr.rewards.spec import COMPONENTS_KEY
 
 
 class BatchedVecEnv(VecEnv):
     """All simulations of a task on one thread pool.
 
-    ``make_vec_env("sb3_gcr/HumanoidRun-v0", 256, vec_env_cls=BatchedVecEnv)`` makes one. Only the first env is built, to learn
-    the task, the time limit and Monitor's arguments from it; the numbers are those that a ``DummyVecEnv`` of the same envs
-    gives. ``reward_components`` has the terms of the last step, shape (N, K), and the infos are filled for finished episodes
-    only.
+    ``make_vec_env("sb3_gcr/HumanoidRun-v0", 256, vec_env_cls=BatchedVecEnv)`` makes one. Only the
+    first env is built, to learn the task, the time limit and Monitor's arguments from it; the
+    numbers are those that a ``DummyVecEnv`` of the same envs gives. ``reward_components`` has the
+    terms of the last step, shape (N, K), and the infos are filled for finished episodes only.
 
     :param env_fns: as for ``DummyVecEnv``; all must make the same env
     :param n_threads: threads that step the simulations; None for all CPUs
-    :raises ValueError: for an env that is no task of this package, or for a wrapper that would be lost
+    :raises ValueError: for an env that is no task of this package, or for a wrapper that would be
+        lost
     """
 
-    def __init__(self, env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], n_threads: int | None = None):
+    def __init__(
+        self, env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], n_threads: int | None = None
+    ):
         if not env_fns:
             raise ValueError("Parameter `env_fns` must contain at least one function, found none.")
         self._env = env_fns[0]()
@@ -49,7 +52,9 @@ class BatchedVecEnv(VecEnv):
         self._t_start = time.time()
         self._is_running = False
         super().__init__(len(env_fns), self._env.observation_space, self._env.action_space)
-        self._actions = np.zeros((self.num_envs, *self.task.action_space.shape), dtype=self.task.action_space.dtype)
+        self._actions = np.zeros(
+            (self.num_envs, *self.task.action_space.shape), dtype=self.task.action_space.dtype
+        )
 
     @property
     def n_diverged(self) -> int:
@@ -74,9 +79,14 @@ class BatchedVecEnv(VecEnv):
         :raises RuntimeError: before the first reset, and after the env was closed
         """
         if not self._is_running:
-            raise RuntimeError("BatchedVecEnv must be reset before a step, and cannot step after `close`.")
+            raise RuntimeError(
+                "BatchedVecEnv must be reset before a step, and cannot step after `close`."
+            )
         if np.shape(actions) != self._actions.shape:
-            raise ValueError(f"Parameter `actions` must have shape {self._actions.shape}, found {np.shape(actions)}.")
+            raise ValueError(
+                f"Parameter `actions` must have shape {self._actions.shape}, found "
+                f"{np.shape(actions)}."
+            )
         self._actions[:] = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -92,8 +102,16 @@ class BatchedVecEnv(VecEnv):
                 infos[index] = {
                     COMPONENTS_KEY: step.components[index].copy(),
                     "terminal_observation": step.observations[index].copy(),
-                    "TimeLimit.truncated": bool(step.truncated[index] and not step.terminated[index]),
-                    **dict(zip(self.reward_spec.return_keys, self.engine.returns[index].tolist(), strict=True)),
+                    "TimeLimit.truncated": bool(
+                        step.truncated[index] and not step.terminated[index]
+                    ),
+                    **dict(
+                        zip(
+                            self.reward_spec.return_keys,
+                            self.engine.returns[index].tolist(),
+                            strict=True,
+                        )
+                    ),
                 }
                 if step.diverged[index]:
                     infos[index]["diverged"] = True
@@ -144,7 +162,8 @@ class BatchedVecEnv(VecEnv):
         return [self._env.get_wrapper_attr(attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of the env that all simulations share; those of its task are set on ``get_attr("task")[0]``.
+        """Set an attribute of the env that all simulations share; those of its task are set on
+        ``get_attr("task")[0]``.
 
         :param attr_name: its name
         :param value: its value
@@ -154,7 +173,11 @@ class BatchedVecEnv(VecEnv):
         setattr(self._env.unwrapped, attr_name, value)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
     ) -> list[Any]:
         """Call a method of the env that all simulations share, once.
 
@@ -164,7 +187,9 @@ class BatchedVecEnv(VecEnv):
         :param method_kwargs: its keyword arguments
         """
         self._demand_all(indices)
-        return [self._env.get_wrapper_attr(method_name)(*method_args, **method_kwargs)] * self.num_envs
+        return [
+            self._env.get_wrapper_attr(method_name)(*method_args, **method_kwargs)
+        ] * self.num_envs
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
@@ -179,7 +204,8 @@ class BatchedVecEnv(VecEnv):
     def _demand_all(self, indices: VecEnvIndices) -> None:
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(
-                f"Parameter `indices` must be None or all {self.num_envs} simulations, because they share one task, "
+                f"Parameter `indices` must be None or all {self.num_envs} simulations, because "
+                "they share one task, "
                 f"found {indices!r}."
             )
 
@@ -194,12 +220,14 @@ def _unwrap(env: gym.Env[Any, Any]) -> tuple[Monitor | None, int | None]:
             max_episode_steps = env._max_episode_steps
         elif not isinstance(env, OrderEnforcing | PassiveEnvChecker):
             raise ValueError(
-                f"BatchedVecEnv steps the simulations itself, so the wrapper {type(env).__name__} would never run. "
+                f"BatchedVecEnv steps the simulations itself, so the wrapper {type(env).__name__} "
+                "would never run. "
                 "Use a VecEnvWrapper around BatchedVecEnv, or DummyVecEnv."
             )
         env = env.env
     if not isinstance(env, TaskEnv):
         raise ValueError(
-            f"BatchedVecEnv needs a task of sb3_gcr, such as 'sb3_gcr/HumanoidRun-v0', found {type(env).__name__}."
+            "BatchedVecEnv needs a task of sb3_gcr, such as 'sb3_gcr/HumanoidRun-v0', found "
+            f"{type(env).__name__}."
         )
     return monitor, max_episode_steps

@@ -11,8 +11,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 class DistanceCurriculum(BaseCallback):
     """Raises ThrowingMO's ``max_distance`` after each rollout, once the robot throws and stands.
 
-    It starts, for good, when the mean returns of the last 100 episodes exceed both thresholds. The distance is logged as
-    ``curriculum/max_distance``.
+    It starts, for good, when the mean returns of the last 100 episodes exceed both thresholds. The
+    distance is logged as ``curriculum/max_distance``.
 
     :param increment: by how much it raises the distance [m]
     :param limit: largest distance [m]
@@ -22,7 +22,12 @@ class DistanceCurriculum(BaseCallback):
     """
 
     def __init__(
-        self, increment: float = 0.01, limit: float = 5.0, throwing: float = 1.0, stability: float = 0.44, verbose: int = 0
+        self,
+        increment: float = 0.01,
+        limit: float = 5.0,
+        throwing: float = 1.0,
+        stability: float = 0.44,
+        verbose: int = 0,
     ):
         super().__init__(verbose)
         if not 1 <= limit <= 5:
@@ -37,7 +42,10 @@ class DistanceCurriculum(BaseCallback):
     def _on_training_start(self) -> None:
         tasks = self.training_env.get_attr("task") if self.training_env.has_attr("task") else [None]
         if not hasattr(tasks[0], "max_distance"):
-            raise ValueError("DistanceCurriculum needs the env 'sb3_gcr/ThrowingMO-v0', found one without targets.")
+            raise ValueError(
+                "DistanceCurriculum needs the env 'sb3_gcr/ThrowingMO-v0', found one without "
+                "targets."
+            )
 
     def _on_step(self) -> bool:
         for index in np.flatnonzero(self.locals["dones"]):

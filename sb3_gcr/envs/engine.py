@@ -22,11 +22,16 @@ except ImportError as error:
     ) from error
 
 #: Warnings after which MuJoCo puts a simulation back to its defaults, or drops its controls.
-_DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")]
+_DIVERGED = [
+    int(getattr(mujoco.mjtWarning, f"mjWARN_{name}"))
+    for name in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
+]
 
 
 def _usable_cpus() -> int:
-    """CPUs that this process may use: fewer than the machine has, in a container or under taskset."""
+    """CPUs that this process may use: fewer than the machine has, in a container or under
+    taskset.
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -37,8 +42,8 @@ class Step(NamedTuple):
     :param components: the terms of the reward, shape (N, K)
     :param terminated: shape (N,)
     :param truncated: whether the time is up, shape (N,)
-    :param diverged: simulations that MuJoCo gave up, shape (N,); they are terminated, with the observation of the step before
-        and no reward
+    :param diverged: simulations that MuJoCo gave up, shape (N,); they are terminated, with the
+        observation of the step before and no reward
     """
 
     observations: Array
@@ -49,10 +54,11 @@ class Step(NamedTuple):
 
 
 class Engine:
-    """Steps N simulations of a task and keeps the statistics of their episodes; resets are left to the caller.
+    """Steps N simulations of a task and keeps the statistics of their episodes; resets are left to
+    the caller.
 
-    Each simulation has its own generator, so that a run with the same seeds gives the same numbers at any N and any number
-    of threads.
+    Each simulation has its own generator, so that a run with the same seeds gives the same numbers
+    at any N and any number of threads.
 
     :param task: the task
     :param n_simulations: N ≥ 1
@@ -61,14 +67,27 @@ class Engine:
     :raises ValueError: for a number that is not positive
     """
 
-    def __init__(self, task: Task, n_simulations: int, n_threads: int | None = None, max_episode_steps: int | None = None):
+    def __init__(
+        self,
+        task: Task,
+        n_simulations: int,
+        n_threads: int | None = None,
+        max_episode_steps: int | None = None,
+    ):
         if n_simulations < 1:
-            raise ValueError(f"Parameter `n_simulations` must be at least 1, found {n_simulations}.")
+            raise ValueError(
+                f"Parameter `n_simulations` must be at least 1, found {n_simulations}."
+            )
         if n_threads is not None and n_threads < 1:
-            raise ValueError(f"Parameter `n_threads` must be at least 1, or None for all CPUs, found {n_threads}.")
+            raise ValueError(
+                "Parameter `n_threads` must be at least 1, or None for all CPUs, found "
+                f"{n_threads}."
+            )
         self.task = task
         self.max_episode_steps = max_episode_steps
-        self.batch = Batch(task.model, n_simulations, min(n_threads or _usable_cpus(), n_simulations))
+        self.batch = Batch(
+            task.model, n_simulations, min(n_threads or _usable_cpus(), n_simulations)
+        )
         self.rows = Rows(
             {name: self.batch.bind(name) for name in {"qpos", "qvel", *task.fields}}
             | {name: np.zeros((n_simulations, *shape)) for name, shape in task.memory.items()}
@@ -78,7 +97,9 @@ class Engine:
         self.lengths = np.zeros(n_simulations, dtype=int)
         #: Simulations that diverged so far.
         self.n_diverged = 0
-        self._observations: Array = np.zeros((n_simulations, *task.observation_space.shape), task.observation_space.dtype)
+        self._observations: Array = np.zeros(
+            (n_simulations, *task.observation_space.shape), task.observation_space.dtype
+        )
 
     def __len__(self) -> int:
         return self.batch.nsim
@@ -147,7 +168,9 @@ class Engine:
                 raise
             warnings.warn(f"{error} Their episodes end here.", stacklevel=3)
             failed = error.ids
-        diverged = (self.batch.warning[:, _DIVERGED, 1] > 0).any(1)  # (last info, count since the reset)
+        diverged = (self.batch.warning[:, _DIVERGED, 1] > 0).any(
+            1
+        )  # (last info, count since the reset)
         diverged |= ~np.isfinite(self.rows.qpos.sum(1) + self.rows.qvel.sum(1))
         diverged[failed] = True
         return diverged

@@ -10,23 +10,32 @@ import numpy as np
 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from numpy.typing import NDArray
 
-from sb3_gcr.components import COMPONENTS_KEY
 from sb3_gcr.envs.engine import Engine
-from sb3_gcr.envs.tasks import make_task
+from sb3_gcr.envs.tasks.catalogue import make_task
+from sb3_gcr.rewards.spec import COMPONENTS_KEY
 
 _NO_CONTEXT = (
-    "No picture could be rendered: MuJoCo found no OpenGL context. Without a screen, set the environment variable "
-    "MUJOCO_GL=egl (Debian and Ubuntu: apt install libegl1 libgl1) or MUJOCO_GL=osmesa (apt install libosmesa6) "
+    "No picture could be rendered: MuJoCo found no OpenGL context. Without a screen, set the "
+    "environment variable "
+    "MUJOCO_GL=egl (Debian and Ubuntu: apt install libegl1 libgl1) or MUJOCO_GL=osmesa (apt "
+    "install libosmesa6) "
     "before Python starts."
 )
-_WINDOW_CAMERA = {"type": mujoco.mjtCamera.mjCAMERA_TRACKING, "trackbodyid": 1, "distance": 4.0, "elevation": -15.0}
+_WINDOW_CAMERA = {
+    "type": mujoco.mjtCamera.mjCAMERA_TRACKING,
+    "trackbodyid": 1,
+    "distance": 4.0,
+    "elevation": -15.0,
+}
 
 
 class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]], gym.utils.EzPickle):
-    """A task of :mod:`sb3_gcr.envs` as a Gymnasium env; ``gym.make("sb3_gcr/HumanoidRun-v0")`` makes one.
+    """A task of :mod:`sb3_gcr.envs` as a Gymnasium env; ``gym.make("sb3_gcr/HumanoidRun-v0")``
+    makes one.
 
-    The info of each step has the terms of the reward by name, all of them in ``reward_components`` (K,), and what each has
-    summed up to since the reset as ``r_<name>``, for Monitor's ``info_keywords``.
+    The info of each step has the terms of the reward by name, all of them in ``reward_components``
+    (K,), and what each has summed up to since the reset as ``r_<name>``, for Monitor's
+    ``info_keywords``.
 
     :param task: name of the task
     :param render_mode: "rgb_array", "human" or None
@@ -37,11 +46,20 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]], gym.utils.EzPickle):
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 as declared there
 
-    def __init__(self, task: str, render_mode: str | None = None, width: int = 640, height: int = 480, **kwargs: Any):
+    def __init__(
+        self,
+        task: str,
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+        **kwargs: Any,
+    ):
         gym.utils.EzPickle.__init__(self, task, render_mode, width, height, **kwargs)
         modes = self.metadata["render_modes"]
         if render_mode not in (None, *modes):
-            raise ValueError(f"Parameter `render_mode` must be one of {modes} or None, found {render_mode!r}.")
+            raise ValueError(
+                f"Parameter `render_mode` must be one of {modes} or None, found {render_mode!r}."
+            )
         self.task = make_task(task, **kwargs)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.task.dt)}
         self.observation_space = self.task.observation_space
@@ -52,7 +70,9 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]], gym.utils.EzPickle):
         self.picture_size = width, height
         self._painter = Painter(self.engine, width, height)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray[Any], dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
         """Start an episode.
 
         :param seed: of the generator, from now on
@@ -117,8 +137,11 @@ class Painter:
             width, height = self._size
             model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
             model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-            # The model's camera follows in pictures, MuJoCo's own in a window, where the mouse moves it.
-            self._renderer = MujocoRenderer(model, self._data, _WINDOW_CAMERA, width, height, camera_name="track")
+            # The model's camera follows in pictures, MuJoCo's own in a window, where the mouse
+            # moves it.
+            self._renderer = MujocoRenderer(
+                model, self._data, _WINDOW_CAMERA, width, height, camera_name="track"
+            )
         self._engine.batch.get_data(index, self._data)
         mujoco.mj_forward(model, self._data)
         try:

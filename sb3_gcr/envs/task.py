@@ -1,4 +1,6 @@
-"""What a task is: a robot, what it observes, the terms of its reward, when it fails, and where it starts."""
+"""What a task is: a robot, what it observes, the terms of its reward, when it fails, and where it
+starts.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_gcr.components import RewardSpec
+from sb3_gcr.rewards.spec import RewardSpec
 
 Array = NDArray[Any]
 
 
 class Rows:
-    """The arrays of N simulations by name, one row per simulation: MuJoCo's fields and what the task remembers.
+    """The arrays of N simulations by name, one row per simulation: MuJoCo's fields and what the
+    task remembers.
 
     :param arrays: arrays of shape (N, …)
     """
@@ -26,7 +29,10 @@ class Rows:
         self.__dict__.update(arrays)
 
     def __getattr__(self, name: str) -> Array:
-        raise AttributeError(f"No array `{name}`: name it in the task's `fields` or `memory`, found {sorted(self.__dict__)}.")
+        raise AttributeError(
+            f"No array `{name}`: name it in the task's `fields` or `memory`, found "
+            f"{sorted(self.__dict__)}."
+        )
 
     def take(self, ids: Array) -> Rows:
         """Copies of some rows.
@@ -39,7 +45,8 @@ class Rows:
 class Task(ABC):
     """One task for one robot, written on batched arrays; it knows neither threads nor SB3.
 
-    Each control step the engine calls :meth:`act`, advances the physics by ``n_substeps``, and calls :meth:`measure`,
+    Each control step the engine calls :meth:`act`, advances the physics by ``n_substeps``, and
+    calls :meth:`measure`,
     :meth:`rewards`, :meth:`terminated` and :meth:`observe`.
     """
 
@@ -51,9 +58,11 @@ class Task(ABC):
     reward_spec: RewardSpec
     observation_space: spaces.Box
     action_space: spaces.Box
-    #: MjData fields that the task reads or writes; those that are no state are one physics step old.
+    #: MjData fields that the task reads or writes; those that are no state are one physics step
+    #: old.
     fields: tuple[str, ...] = ("qpos", "qvel", "ctrl")
-    #: Shapes of the arrays per simulation that the task keeps between steps; zero at the start of an episode.
+    #: Shapes of the arrays per simulation that the task keeps between steps; zero at the start of
+    #: an episode.
     memory: dict[str, tuple[int, ...]]
 
     @property
@@ -63,7 +72,8 @@ class Task(ABC):
 
     @abstractmethod
     def start(self, rng: np.random.Generator) -> dict[str, ArrayLike]:
-        """Draw the start of one episode: values by field or memory name; what is not named keeps the model's default.
+        """Draw the start of one episode: values by field or memory name; what is not named keeps
+        the model's default.
 
         :param rng: the generator of that simulation
         """

@@ -11,18 +11,20 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from sb3_gcr.components import COMPONENTS_KEY
 from sb3_gcr.envs.engine import Engine
-from sb3_gcr.envs.tasks import make_task
+from sb3_gcr.envs.tasks.catalogue import make_task
+from sb3_gcr.rewards.spec import COMPONENTS_KEY
 
 Array = NDArray[Any]
 
 
 class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, Array]):
-    """A task of :mod:`sb3_gcr.envs` as a Gymnasium vector env; ``gym.make_vec("sb3_gcr/HumanoidRun-v0", 256)`` makes one.
+    """A task of :mod:`sb3_gcr.envs` as a Gymnasium vector env;
+    ``gym.make_vec("sb3_gcr/HumanoidRun-v0", 256)`` makes one.
 
-    Finished episodes start anew in the same step: ``info["final_obs"]`` and ``info["final_info"]`` say how they ended, and
-    ``info["reward_components"]``, shape (N, K), always has the terms of the step just made.
+    Finished episodes start anew in the same step: ``info["final_obs"]`` and ``info["final_info"]``
+    say how they ended, and ``info["reward_components"]``, shape (N, K), always has the terms of the
+    step just made.
 
     :param task: name of the task
     :param num_envs: N
@@ -51,17 +53,24 @@ class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Array, dict[str, Any]]:
         """Start all episodes.
 
-        :param seed: None, the seed of the first simulation (the next ones count up), or one for each
+        :param seed: None, the seed of the first simulation (the next ones count up), or one for
+            each
         :param options: not used
         """
         if isinstance(seed, int):
             seed = [seed + index for index in range(self.num_envs)]
         if seed is not None and len(seed) != self.num_envs:
-            raise ValueError(f"Parameter `seed` must be an integer or have {self.num_envs} entries, found {len(seed)}.")
+            raise ValueError(
+                f"Parameter `seed` must be an integer or have {self.num_envs} entries, found "
+                f"{len(seed)}."
+            )
         for index, own in enumerate(seed or []):
             if own is not None:
                 self.engine.seed(index, own)

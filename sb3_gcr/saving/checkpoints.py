@@ -1,4 +1,6 @@
-"""Files that are whole: the old model or the new one, never half; and which of them is the newest."""
+"""Files that are whole: the old model or the new one, never half; and which of them is the
+newest.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,11 @@ from pathlib import Path
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[io.BufferedRandom]:
-    """A temporary file beside ``path`` that replaces it in one step once the block has ended and the disk has it all.
+    """A temporary file beside ``path`` that replaces it in one step once the block has ended and
+    the disk has it all.
 
-    After an error ``path`` is as it was. A process that is killed leaves it as it was, too, and the hidden temporary file.
+    After an error ``path`` is as it was. A process that is killed leaves it as it was, too, and the
+    hidden temporary file.
 
     :param path: where the file belongs
     """
@@ -46,7 +50,8 @@ def _sync_folder(folder: Path) -> None:
 
 
 def saving_path(path: str | Path) -> Path:
-    """Where SB3 would save: with its suffix, in a folder that exists, beside a folder of that name; links are followed.
+    """Where SB3 would save: with its suffix, in a folder that exists, beside a folder of that name;
+    links are followed.
 
     :param path: as for ``model.save``
     """
@@ -63,9 +68,11 @@ def saving_path(path: str | Path) -> Path:
 
 
 def latest_checkpoint(folder: str | Path, name_prefix: str = "rl_model") -> Path | None:
-    """The checkpoint with the most steps in a folder of SB3's ``CheckpointCallback``, None where there is none yet.
+    """The checkpoint with the most steps in a folder of SB3's ``CheckpointCallback``, None where
+    there is none yet.
 
-    With it a training that was killed goes on where its last checkpoint was made, VecNormalize's statistics included::
+    With it a training that was killed goes on where its last checkpoint was made, VecNormalize's
+    statistics included::
 
         checkpoint = latest_checkpoint("checkpoints")
         model = GCRPPO.load(checkpoint, env=env) if checkpoint else GCRPPO("MlpPolicy", env)
@@ -74,15 +81,22 @@ def latest_checkpoint(folder: str | Path, name_prefix: str = "rl_model") -> Path
 
     :param folder: ``save_path`` of the callback; it need not exist
     :param name_prefix: ``name_prefix`` of the callback
-    :return: a file that is a whole zip; half ones, which SB3's own ``save`` can leave behind, are passed over
+    :return: a file that is a whole zip; half ones, which SB3's own ``save`` can leave behind, are
+        passed over
     """
     pattern = re.compile(rf"{re.escape(name_prefix)}_(\d+)_steps\.zip")
-    found = [(int(match[1]), path) for path in Path(folder).glob("*.zip") if (match := pattern.fullmatch(path.name))]
+    found = [
+        (int(match[1]), path)
+        for path in Path(folder).glob("*.zip")
+        if (match := pattern.fullmatch(path.name))
+    ]
     return next((path for _, path in sorted(found, reverse=True) if _is_whole(path)), None)
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether a model's file has its end; ``zipfile.is_zipfile`` is content with that of a state dict in half a file."""
+    """Whether a model's file has its end; ``zipfile.is_zipfile`` is content with that of a state
+    dict in half a file.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             return "data" in archive.namelist()

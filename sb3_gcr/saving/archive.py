@@ -1,4 +1,6 @@
-"""What a model's file holds: SB3's entries, and beside them ``sb3_gcr.json``, which says as much as plain JSON can."""
+"""What a model's file holds: SB3's entries, and beside them ``sb3_gcr.json``, which says as much as
+plain JSON can.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.save_util import load_from_zip_file, open_path
 from stable_baselines3.common.utils import get_device
 
-from sb3_gcr.components import SCALAR_REWARD, RewardSpec
-from sb3_gcr.plain_settings import (
+from sb3_gcr.rewards.spec import SCALAR_REWARD, RewardSpec
+from sb3_gcr.saving.settings import (
     POLICIES,
     collect_settings,
     describe_object,
@@ -29,7 +31,7 @@ from sb3_gcr.plain_settings import (
     parse_settings,
     to_plain,
 )
-from sb3_gcr.vec_statistics import describe_statistics
+from sb3_gcr.saving.statistics import describe_statistics
 
 #: The entry's name; SB3 reads "data" and the entries that end in .pth, and passes over all others.
 ENTRY = "sb3_gcr.json"
@@ -81,13 +83,20 @@ def describe_model(model: OnPolicyAlgorithm, spec: RewardSpec) -> dict[str, Any]
         "settings": plain,
         "not_plain": rest,
         **_describe_spaces(model.observation_space, model.action_space),
-        "counters": {name: to_plain(model.__dict__[name]) for name in COUNTERS if name in model.__dict__},
+        "counters": {
+            name: to_plain(model.__dict__[name]) for name in COUNTERS if name in model.__dict__
+        },
         "vec_normalize": None if vec_normalize is None else describe_statistics(vec_normalize),
     }
 
 
-def _describe_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> dict[str, Any]:
-    return {"observation_space": describe_space(observation_space), "action_space": describe_space(action_space)}
+def _describe_spaces(
+    observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> dict[str, Any]:
+    return {
+        "observation_space": describe_space(observation_space),
+        "action_space": describe_space(action_space),
+    }
 
 
 def append_description(file: IO[bytes], description: Mapping[str, Any]) -> None:
@@ -124,7 +133,9 @@ def read_statistics(path: ModelPath) -> dict[str, Any] | None:
     :param path: as for ``model.load``
     """
     entries = read_entries(path, [ENTRY])
-    statistics: dict[str, Any] | None = json.loads(entries[ENTRY])["vec_normalize"] if entries else None
+    statistics: dict[str, Any] | None = (
+        json.loads(entries[ENTRY])["vec_normalize"] if entries else None
+    )
     return statistics
 
 
@@ -134,22 +145,31 @@ def read_plain(path: ModelPath, device: th.device | str, given: Collection[str] 
     :param path: as for ``model.load``
     :param device: where the weights go
     :param given: names of settings that the file need not have, because the caller has them
-    :raises ValueError: if the file has no plain settings, or needs more than those, or holds more than tensors
+    :raises ValueError: if the file has no plain settings, or needs more than those, or holds more
+        than tensors
     """
     entries = read_entries(path, [ENTRY, "policy.pth", "policy.optimizer.pth"])
     if ENTRY not in entries:
         raise ValueError(
-            f"Parameter `weights_only` must be False for this file, found True: it has no entry {ENTRY!r}, which "
+            "Parameter `weights_only` must be False for this file, found True: it has no entry "
+            f"{ENTRY!r}, which "
             "`GCRPPO.save` writes. Load it without, if you trust it."
         )
     described = json.loads(entries.pop(ENTRY))
     if described["format"] != FORMAT:
-        raise ValueError(f"The entry {ENTRY!r} must have format {FORMAT}, found {described['format']!r}.")
-    missing = {name: what for name, what in described["not_plain"].items() if name.partition("[")[0] not in given}
+        raise ValueError(
+            f"The entry {ENTRY!r} must have format {FORMAT}, found {described['format']!r}."
+        )
+    missing = {
+        name: what
+        for name, what in described["not_plain"].items()
+        if name.partition("[")[0] not in given
+    }
     if missing:
         listed = ", ".join(f"{name} ({what})" for name, what in missing.items())
         raise ValueError(
-            f"Parameter `weights_only` must be False for this file, found True: it needs {listed}. Give what is missing as "
+            f"Parameter `weights_only` must be False for this file, found True: it needs {listed}. "
+            "Give what is missing as "
             "keyword arguments, or load it without, if you trust it."
         )
     return SavedModel(
@@ -157,7 +177,10 @@ def read_plain(path: ModelPath, device: th.device | str, given: Collection[str] 
         spec=RewardSpec.from_dict(described["components"]),
         settings=parse_settings(described["settings"]),
         spaces={name: described[name] for name in ("observation_space", "action_space")},
-        parameters={name.removesuffix(".pth"): _read_tensors(name, content, device) for name, content in entries.items()},
+        parameters={
+            name.removesuffix(".pth"): _read_tensors(name, content, device)
+            for name, content in entries.items()
+        },
         counters=_check_counters(described["counters"]),
         statistics=described["vec_normalize"],
     )
@@ -168,17 +191,24 @@ def _read_tensors(name: str, content: bytes, device: th.device | str) -> Any:
         return th.load(io.BytesIO(content), map_location=get_device(device), weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
         reason = str(error).splitlines()[0]
-        raise ValueError(f"The entry {name!r} must hold tensors and nothing else: {reason}") from None
+        raise ValueError(
+            f"The entry {name!r} must hold tensors and nothing else: {reason}"
+        ) from None
 
 
 def _check_counters(counters: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in counters.items():
         if name not in COUNTERS or not isinstance(value, int | float | None):
-            raise ValueError(f"The counters in a file must be numbers named {list(COUNTERS)}, found {name}={value!r}.")
+            raise ValueError(
+                f"The counters in a file must be numbers named {list(COUNTERS)}, found "
+                f"{name}={value!r}."
+            )
     return dict(counters)
 
 
-def read_pickled(path: ModelPath, device: th.device | str, custom_objects: dict[str, Any] | None = None) -> SavedModel:
+def read_pickled(
+    path: ModelPath, device: th.device | str, custom_objects: dict[str, Any] | None = None
+) -> SavedModel:
     """Read the file of a PPO or a GCRPPO; that runs the pickled code in it.
 
     :param path: as for ``model.load``
@@ -188,8 +218,15 @@ def read_pickled(path: ModelPath, device: th.device | str, custom_objects: dict[
     """
     data, parameters, _ = load_from_zip_file(path, device=device, custom_objects=custom_objects)
     policy = (data or {}).get("policy_class")
-    if data is None or not (isinstance(policy, type) and issubclass(policy, ActorCriticPolicy)) or "n_epochs" not in data:
-        raise ValueError(f"Parameter `path` must be the file of a PPO or a GCRPPO, found another's, with policy {policy!r}.")
+    if (
+        data is None
+        or not (isinstance(policy, type) and issubclass(policy, ActorCriticPolicy))
+        or "n_epochs" not in data
+    ):
+        raise ValueError(
+            "Parameter `path` must be the file of a PPO or a GCRPPO, found another's, with policy "
+            f"{policy!r}."
+        )
     return SavedModel(
         policy=POLICIES.get(policy, policy),
         spec=data.get("reward_spec", SCALAR_REWARD),
@@ -200,7 +237,9 @@ def read_pickled(path: ModelPath, device: th.device | str, custom_objects: dict[
     )
 
 
-def check_spaces(saved: SavedModel, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+def check_spaces(
+    saved: SavedModel, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> None:
     """Refuse an env that the model in a file does not fit.
 
     :param saved: the model in the file
@@ -209,6 +248,11 @@ def check_spaces(saved: SavedModel, observation_space: spaces.Space[Any], action
     :raises ValueError: says what differs
     """
     found = _describe_spaces(observation_space, action_space)
-    differences = [line for name in found for line in find_differences(saved.spaces[name], found[name], name)]
+    differences = [
+        line for name in found for line in find_differences(saved.spaces[name], found[name], name)
+    ]
     if differences:
-        raise ValueError(f"Parameter `env` must have the spaces of the saved model, found others: {'; '.join(differences)}.")
+        raise ValueError(
+            "Parameter `env` must have the spaces of the saved model, found others: "
+            f"{'; '.join(differences)}."
+        )

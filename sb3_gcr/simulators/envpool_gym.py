@@ -1,4 +1,6 @@
-"""EnvPool's envs by Gymnasium ids, for tools that make and watch envs one by one; ``pool_of`` makes many at once again."""
+"""EnvPool's envs by Gymnasium ids, for tools that make and watch envs one by one; ``pool_of`` makes
+many at once again.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,8 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from sb3_gcr.components import COMPONENTS_KEY
-from sb3_gcr.envs.envpool import ENVPOOL_ENVS, EnvPoolVecEnv
+from sb3_gcr.rewards.spec import COMPONENTS_KEY
+from sb3_gcr.simulators.envpool import ENVPOOL_ENVS, EnvPoolVecEnv
 
 
 class EnvPoolEnv(gym.Env[Any, Any]):
@@ -28,11 +30,16 @@ class EnvPoolEnv(gym.Env[Any, Any]):
     def __init__(self, env_id: str, **kwargs: Any):
         self.arguments = {"env_id": env_id, **kwargs}
         self._pool = EnvPoolVecEnv(num_envs=1, num_threads=1, **self.arguments)
-        self.observation_space, self.action_space = self._pool.observation_space, self._pool.action_space
+        self.observation_space, self.action_space = (
+            self._pool.observation_space,
+            self._pool.action_space,
+        )
         self.reward_spec = self._pool.reward_spec
         self._returns = np.zeros(len(self.reward_spec))
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode.
 
         :param seed: of the env
@@ -66,11 +73,18 @@ class EnvPoolEnv(gym.Env[Any, Any]):
 
 
 def _first(observations: Any) -> Any:
-    return {key: rows[0] for key, rows in observations.items()} if isinstance(observations, dict) else observations[0]
+    return (
+        {key: rows[0] for key, rows in observations.items()}
+        if isinstance(observations, dict)
+        else observations[0]
+    )
 
 
-def pool_of(env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], n_threads: int | None = None) -> VecEnv:
-    """As many envs as functions in one pool, with Monitor's file: ``make_vec_env("envpool/Ant-v5", 64, vec_env_cls=pool_of)``.
+def pool_of(
+    env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], n_threads: int | None = None
+) -> VecEnv:
+    """As many envs as functions in one pool, with Monitor's file: ``make_vec_env("envpool/Ant-v5",
+    64, vec_env_cls=pool_of)``.
 
     Only the first env is built, to learn its settings and Monitor's arguments from it.
 
@@ -81,12 +95,18 @@ def pool_of(env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], n_threads: int |
     first = env_fns[0]()
     made = first.unwrapped
     if not isinstance(made, EnvPoolEnv):
-        raise ValueError(f"`pool_of` needs an env of EnvPool, such as 'envpool/Humanoid-v5', found {type(made).__name__}.")
+        raise ValueError(
+            "`pool_of` needs an env of EnvPool, such as 'envpool/Humanoid-v5', found "
+            f"{type(made).__name__}."
+        )
     env, monitor = first, None
     while isinstance(env, gym.Wrapper):
         monitor = env if isinstance(env, Monitor) else monitor
         if not isinstance(env, Monitor | OrderEnforcing | PassiveEnvChecker):
-            raise ValueError(f"EnvPool steps the envs itself, so the wrapper {type(env).__name__} would never run.")
+            raise ValueError(
+                f"EnvPool steps the envs itself, so the wrapper {type(env).__name__} would never "
+                "run."
+            )
         env = env.env
     first.close()
     pool = EnvPoolVecEnv(num_envs=len(env_fns), num_threads=n_threads, **made.arguments)
@@ -101,5 +121,5 @@ def register_pools() -> None:
     """Make EnvPool's envs known to Gymnasium as ``envpool/<id>``; importing sb3_gcr does it."""
     for env_id in ENVPOOL_ENVS:
         if f"envpool/{env_id}" not in gym.registry:
-            entry_point = "sb3_gcr.envs.envpool_gym:EnvPoolEnv"
+            entry_point = "sb3_gcr.simulators.envpool_gym:EnvPoolEnv"
             gym.register(id=f"envpool/{env_id}", entry_point=entry_point, kwargs={"env_id": env_id})

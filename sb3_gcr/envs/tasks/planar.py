@@ -1,4 +1,6 @@
-"""Gymnasium's Hopper, Walker2d, HalfCheetah and Swimmer v5, number for number, on many simulations."""
+"""Gymnasium's Hopper, Walker2d, HalfCheetah and Swimmer v5, number for number, on many
+simulations.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_gcr.components import GYMNASIUM_ENVS, RewardSpec
 from sb3_gcr.envs.task import Array, Rows, Task, unbounded
+from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS
+from sb3_gcr.rewards.spec import RewardSpec
 
 ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
 
@@ -54,7 +57,9 @@ class PlanarTask(Task):
         self.reward_spec = RewardSpec.from_dict(GYMNASIUM_ENVS[env_id]["components"])
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         self.action_space = spaces.Box(low, high, dtype=np.float32)
-        self.observation_space = unbounded(self.model.nq - self.n_hidden + self.model.nv, np.float64)
+        self.observation_space = unbounded(
+            self.model.nq - self.n_hidden + self.model.nv, np.float64
+        )
         self.memory = {"x_before": ()}
 
     def start(self, rng: np.random.Generator) -> dict[str, ArrayLike]:
@@ -105,7 +110,9 @@ class Swimmer(PlanarTask):
 
 
 class LeggedTask(PlanarTask):
-    """A robot that may fall: it is paid for staying up, and its velocities are observed between ±10."""
+    """A robot that may fall: it is paid for staying up, and its velocities are observed between
+    ±10.
+    """
 
     z_range: ClassVar[tuple[float, float]]
     angle_range: ClassVar[tuple[float, float]]

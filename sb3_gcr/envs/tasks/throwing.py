@@ -1,6 +1,7 @@
 """Throwing-MO: a Unitree G1 throws a ball at a point and, if wanted, does so in a chosen manner.
 
-Control rate, time limit, command and the six base terms are those of the paper; docs/tasks.md lists what differs.
+Control rate, time limit, command and the six base terms are those of the paper; docs/tasks.md lists
+what differs.
 """
 
 from __future__ import annotations
@@ -12,23 +13,32 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_gcr.components import RewardSpec
-from sb3_gcr.envs.geometry import into_frame, yaw_and_roll
-from sb3_gcr.envs.objectives import choose_ranges, inside
 from sb3_gcr.envs.task import Array, Rows, Task, unbounded
+from sb3_gcr.envs.tasks.geometry import into_frame, yaw_and_roll
+from sb3_gcr.envs.tasks.ranges import choose_ranges, inside
+from sb3_gcr.rewards.spec import RewardSpec
 
 #: Physics steps of 5 ms per control step: 50 Hz control; control steps per episode: 2 s.
 N_SUBSTEPS, EPISODE_STEPS = 4, 100
 #: Duration of a control step [s].
 DT = 0.02
-#: An action of 1 moves a joint's target by this much from the default pose [rad]; actions go from -5 to 5.
+#: An action of 1 moves a joint's target by this much from the default pose [rad]; actions go from
+#: -5 to 5.
 ACTION_SCALE, ACTION_BOUND = 0.5, 5.0
 #: Height of the pelvis at the start [m].
 START_HEIGHT = 0.74
 #: Noise of the first joint positions, and more of it in the arms [rad].
 JOINT_NOISE, ARM_NOISE = 0.05, 0.3
-#: Where the right fingers' joints are when the hand is closed [rad]; open, and at the left, they are at 0.
-CLOSED_FINGERS = {"one": -0.525, "two": -0.915, "three": 1.05, "four": 1.83, "five": 1.05, "six": 1.83}
+#: Where the right fingers' joints are when the hand is closed [rad]; open, and at the left, they
+#: are at 0.
+CLOSED_FINGERS = {
+    "one": -0.525,
+    "two": -0.915,
+    "three": 1.05,
+    "four": 1.83,
+    "five": 1.05,
+    "six": 1.83,
+}
 #: The hand lets the ball go once its fingers have opened by this share of the way.
 LET_GO = 0.5
 #: Height at which a flying ball has landed [m], and points looked at on its way.
@@ -37,24 +47,50 @@ GRAVITY = 9.81
 #: Ranges of the six objectives, lower bound included, upper bound excluded.
 RANGES: dict[str, tuple[tuple[float, float], ...]] = {
     "energy": ((25, 50), (50, 100), (100, 200), (200, 400), (400, 800)),  # mechanical power [W]
-    "baseh": ((0.45, 0.50), (0.50, 0.55), (0.55, 0.60), (0.60, 0.65), (0.65, 0.70)),  # height of the pelvis [m]
+    "baseh": (
+        (0.45, 0.50),
+        (0.50, 0.55),
+        (0.55, 0.60),
+        (0.60, 0.65),
+        (0.65, 0.70),
+    ),  # height of the pelvis [m]
     "ballrel": ((0.0, 0.3), (0.3, 0.6), (0.6, 0.9), (0.9, 1.2), (1.2, 1.5)),  # time of release [s]
-    "bodymo": ((0.0, 0.25), (0.25, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 2.0)),  # speed of the torso at release [m/s]
-    "lftarm": ((0.4, 0.6), (0.6, 0.8), (0.8, 1.0), (1.0, 1.2), (1.2, 1.4)),  # height of the left palm at release [m]
-    "rgtarm": ((0.3, 0.5), (0.5, 0.7), (0.7, 0.9), (0.9, 1.1), (1.1, 1.3)),  # height of the right palm at release [m]
+    "bodymo": (
+        (0.0, 0.25),
+        (0.25, 0.5),
+        (0.5, 1.0),
+        (1.0, 1.5),
+        (1.5, 2.0),
+    ),  # speed of the torso at release [m/s]
+    "lftarm": (
+        (0.4, 0.6),
+        (0.6, 0.8),
+        (0.8, 1.0),
+        (1.0, 1.2),
+        (1.2, 1.4),
+    ),  # height of the left palm at release [m]
+    "rgtarm": (
+        (0.3, 0.5),
+        (0.5, 0.7),
+        (0.7, 0.9),
+        (0.9, 1.1),
+        (1.1, 1.3),
+    ),  # height of the right palm at release [m]
 }
 
 
 def throwing(miss: Array) -> Array:
     """4.1 times what is left of 1 after the miss, once, when the ball is let go.
 
-    :param miss: smallest distance between ball and target on the ball's way, over the target's distance; NaN unless let go now
+    :param miss: smallest distance between ball and target on the ball's way, over the target's
+        distance; NaN unless let go now
     """
     return np.where(np.isnan(miss), 0, 4.1 * np.maximum(0, 1 - miss))
 
 
 def roll(angle: Array) -> Array:
-    """-0.0086 σ(10 (ρ - 0.3)) (1 - exp(-(ρ - 0.1) / 0.1)), with ρ the size of the pelvis' roll; a little above 0 below 0.1.
+    """-0.0086 σ(10 (ρ - 0.3)) (1 - exp(-(ρ - 0.1) / 0.1)), with ρ the size of the pelvis' roll; a
+    little above 0 below 0.1.
 
     :param angle: roll of the pelvis [rad]
     """
@@ -63,7 +99,8 @@ def roll(angle: Array) -> Array:
 
 
 def stability(height: Array, has_collided: Array, is_late: Array) -> Array:
-    """0.005 while the robot stands above 0.38 m, touches the ground with its feet only, and still can, or did, throw.
+    """0.005 while the robot stands above 0.38 m, touches the ground with its feet only, and still
+    can, or did, throw.
 
     :param height: of the pelvis [m]
     :param has_collided: whether anything but a foot has just touched the ground
@@ -117,7 +154,8 @@ def paid_at_release(values: Array, bounds: tuple[float, float], is_released: Arr
 
 
 def closest_approach(ball: Array, velocity: Array, target: Array) -> tuple[Array, Array]:
-    """Smallest distance to the target [m] and the time until then [s] of a ball that flies freely until it lands, each (n,).
+    """Smallest distance to the target [m] and the time until then [s] of a ball that flies freely
+    until it lands, each (n,).
 
     :param ball: position [m], shape (n, 3)
     :param velocity: [m/s], shape (n, 3)
@@ -134,9 +172,11 @@ def closest_approach(ball: Array, velocity: Array, target: Array) -> tuple[Array
 
 
 class ThrowingMO(Task):
-    """The G1 throws a ball at a point on a half sphere around it; six terms, and up to six objectives that pay inside a range.
+    """The G1 throws a ball at a point on a half sphere around it; six terms, and up to six
+    objectives that pay inside a range.
 
-    :param max_distance: targets are drawn between 1 m and this distance, at most 5 m; may be changed between episodes
+    :param max_distance: targets are drawn between 1 m and this distance, at most 5 m; may be
+        changed between episodes
     :param energy: index of the range of the mechanical power, 0 to 4, or None
     :param baseh: index of the range of the pelvis' height
     :param ballrel: index of the range of the time of release
@@ -171,7 +211,14 @@ class ThrowingMO(Task):
         rgtarm: int | None = None,
     ):
         self.max_distance = max_distance
-        chosen = {"energy": energy, "baseh": baseh, "ballrel": ballrel, "bodymo": bodymo, "lftarm": lftarm, "rgtarm": rgtarm}
+        chosen = {
+            "energy": energy,
+            "baseh": baseh,
+            "ballrel": ballrel,
+            "bodymo": bodymo,
+            "lftarm": lftarm,
+            "rgtarm": rgtarm,
+        }
         self.ranges = choose_ranges(RANGES, chosen)
         self.reward_spec = RewardSpec.from_dict(
             {"throwing": "task", "roll": "task", "stability": "task"}
@@ -181,11 +228,23 @@ class ThrowingMO(Task):
         self.model = mujoco.MjModel.from_xml_path(str(files("sb3_gcr.envs") / "assets/g1.xml"))
         self._data = mujoco.MjData(self.model)
         self._find_indices()
-        self.action_space = spaces.Box(-ACTION_BOUND, ACTION_BOUND, (len(self._body) + 1,), np.float32)
+        self.action_space = spaces.Box(
+            -ACTION_BOUND, ACTION_BOUND, (len(self._body) + 1,), np.float32
+        )
         self.observation_space = unbounded(86)
         n_touches = len(self._touches)
-        self.memory = {"actions": self.action_space.shape, "actions_before": self.action_space.shape, "target": (3,)}
-        self.memory |= {"has_thrown": (), "releases": (), "touched": (n_touches,), "collided": (), "time_step": ()}
+        self.memory = {
+            "actions": self.action_space.shape,
+            "actions_before": self.action_space.shape,
+            "target": (3,),
+        }
+        self.memory |= {
+            "has_thrown": (),
+            "releases": (),
+            "touched": (n_touches,),
+            "collided": (),
+            "time_step": (),
+        }
 
     @property
     def max_distance(self) -> float:
@@ -195,7 +254,9 @@ class ThrowingMO(Task):
     @max_distance.setter
     def max_distance(self, value: float) -> None:
         if not 1 <= value <= 5:
-            raise ValueError(f"Parameter `max_distance` must be between 1 and 5 m, found {value!r}.")
+            raise ValueError(
+                f"Parameter `max_distance` must be between 1 and 5 m, found {value!r}."
+            )
         self._max_distance = float(value)
 
     def _find_indices(self) -> None:
@@ -206,16 +267,22 @@ class ThrowingMO(Task):
         self._default = model.key("default").qpos
         self._joints = slice(7, 7 + model.nu)
         self._body = np.flatnonzero(~is_finger)
-        self._arms = [index for index in self._body if "shoulder" in names[index] or "elbow" in names[index]]
+        self._arms = [
+            index for index in self._body if "shoulder" in names[index] or "elbow" in names[index]
+        ]
         self._fingers = [names.index(f"right_{finger}_joint") for finger in CLOSED_FINGERS]
         self._closed = np.array(list(CLOSED_FINGERS.values()))
-        self._left_palm, self._right_palm = (model.site(f"{side}_palm").id for side in ("left", "right"))
+        self._left_palm, self._right_palm = (
+            model.site(f"{side}_palm").id for side in ("left", "right")
+        )
         self._ball = slice(7 + model.nu, 10 + model.nu)
         self._ball_velocity = slice(6 + model.nu, 9 + model.nu)
         sensors = [model.sensor(index).name for index in range(model.nsensor)]
         self._touches = [index for index, name in enumerate(sensors) if name.startswith("touch_")]
         fingers_and_palms = ("palm", *(f"{finger}_link" for finger in ("zero", *CLOSED_FINGERS)))
-        self._is_hand = np.array([sensors[index].endswith(fingers_and_palms) for index in self._touches])
+        self._is_hand = np.array(
+            [sensors[index].endswith(fingers_and_palms) for index in self._touches]
+        )
 
     def start(self, rng: np.random.Generator) -> dict[str, ArrayLike]:
         """The default pose with noise, the ball in the closed right hand, and a target."""
@@ -228,23 +295,33 @@ class ThrowingMO(Task):
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self._data)
         qpos[self._ball] = self._data.site("right_grip").xpos
-        distance, cosine, azimuth = rng.uniform(1, self.max_distance), rng.uniform(0, 1), rng.uniform(0, 2 * np.pi)
+        distance, cosine, azimuth = (
+            rng.uniform(1, self.max_distance),
+            rng.uniform(0, 1),
+            rng.uniform(0, 2 * np.pi),
+        )
         sine = np.sqrt(1 - cosine**2)
         target = distance * np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
         return {"qpos": qpos, "target": target, "mocap_pos": target[None]}
 
     def act(self, s: Rows, actions: Array) -> None:
-        """Targets of the body's joints, and one number that closes the right hand, or opens it below 0."""
+        """Targets of the body's joints, and one number that closes the right hand, or opens it
+        below 0.
+        """
         s.actions_before[:] = s.actions
         s.actions[:] = actions
         s.ctrl[:] = 0
-        s.ctrl[:, self._body] = self._default[self._joints][self._body] + ACTION_SCALE * actions[:, :-1]
+        s.ctrl[:, self._body] = (
+            self._default[self._joints][self._body] + ACTION_SCALE * actions[:, :-1]
+        )
         s.ctrl[:, self._fingers] = self._closed * (actions[:, -1:] >= 0)
 
     def measure(self, s: Rows) -> None:
         """Let the ball go if the hand is open, and notice new contacts."""
         s.time_step[:] += 1
-        closure = (s.qpos[:, self._joints][:, self._fingers] / self._closed).sum(1) / len(self._closed)
+        closure = (s.qpos[:, self._joints][:, self._fingers] / self._closed).sum(1) / len(
+            self._closed
+        )
         s.releases[:] = (closure < 1 - LET_GO) & (s.has_thrown == 0)
         s.has_thrown[:] += s.releases
         s.eq_active[:, 0] = s.has_thrown == 0
@@ -263,9 +340,15 @@ class ThrowingMO(Task):
             "energy": lambda bounds: paid_each_step(self.power(s), bounds),
             "baseh": lambda bounds: paid_each_step(s.qpos[:, 2], bounds),
             "ballrel": lambda bounds: paid_at_release(DT * s.time_step, bounds, is_released),
-            "bodymo": lambda bounds: paid_at_release(np.linalg.norm(s.qvel[:, :3], axis=1), bounds, is_released),
-            "lftarm": lambda bounds: paid_at_release(s.site_xpos[:, self._left_palm, 2], bounds, is_released),
-            "rgtarm": lambda bounds: paid_at_release(s.site_xpos[:, self._right_palm, 2], bounds, is_released),
+            "bodymo": lambda bounds: paid_at_release(
+                np.linalg.norm(s.qvel[:, :3], axis=1), bounds, is_released
+            ),
+            "lftarm": lambda bounds: paid_at_release(
+                s.site_xpos[:, self._left_palm, 2], bounds, is_released
+            ),
+            "rgtarm": lambda bounds: paid_at_release(
+                s.site_xpos[:, self._right_palm, 2], bounds, is_released
+            ),
         }
         return [
             throwing(miss),
@@ -278,11 +361,15 @@ class ThrowingMO(Task):
         ]
 
     def terminated(self, s: Rows) -> NDArray[np.bool_]:
-        """Never: a robot that has fallen can still throw, and is not saved the costs of having fallen."""
+        """Never: a robot that has fallen can still throw, and is not saved the costs of having
+        fallen.
+        """
         return np.zeros(len(s.qpos), dtype=bool)
 
     def observe(self, s: Rows) -> Array:
-        """Attitude, target, joints, last action, and where the ball would go if it were let go now; see docs/tasks.md."""
+        """Attitude, target, joints, last action, and where the ball would go if it were let go now;
+        see docs/tasks.md.
+        """
         quaternion = s.qpos[:, 3:7]
         down = np.zeros((len(s.qpos), 3))
         down[:, 2] = -1
@@ -305,12 +392,18 @@ class ThrowingMO(Task):
         )
 
     def foresee(self, s: Rows) -> tuple[Array, Array]:
-        """The miss if the ball flew freely from now on, over the target's distance, and the time until then [s], each (n,)."""
-        distance, time = closest_approach(s.qpos[:, self._ball], s.qvel[:, self._ball_velocity], s.target)
+        """The miss if the ball flew freely from now on, over the target's distance, and the time
+        until then [s], each (n,).
+        """
+        distance, time = closest_approach(
+            s.qpos[:, self._ball], s.qvel[:, self._ball_velocity], s.target
+        )
         return distance / np.linalg.norm(s.target, axis=1), time
 
     def torques(self, s: Rows) -> Array:
-        """Torques of the PD controllers [N m], shape (N, 37); the model has their damping in the joints."""
+        """Torques of the PD controllers [N m], shape (N, 37); the model has their damping in the
+        joints.
+        """
         joints = slice(6, 6 + self.model.nu)
         return s.qfrc_actuator[:, joints] + s.qfrc_damper[:, joints]
 

@@ -10,13 +10,13 @@ if TYPE_CHECKING:
 
 #: Where each task is, and its time limit in control steps.
 TASKS: dict[str, tuple[str, int]] = {
-    "HumanoidRun": ("sb3_gcr.envs.humanoid", 900),
-    "HumanoidMO": ("sb3_gcr.envs.humanoid", 900),
-    "ThrowingMO": ("sb3_gcr.envs.throwing", 100),
-    "Hopper": ("sb3_gcr.envs.planar", 1000),
-    "Walker2d": ("sb3_gcr.envs.planar", 1000),
-    "HalfCheetah": ("sb3_gcr.envs.planar", 1000),
-    "Swimmer": ("sb3_gcr.envs.planar", 1000),
+    "HumanoidRun": ("sb3_gcr.envs.tasks.humanoid", 900),
+    "HumanoidMO": ("sb3_gcr.envs.tasks.humanoid", 900),
+    "ThrowingMO": ("sb3_gcr.envs.tasks.throwing", 100),
+    "Hopper": ("sb3_gcr.envs.tasks.planar", 1000),
+    "Walker2d": ("sb3_gcr.envs.tasks.planar", 1000),
+    "HalfCheetah": ("sb3_gcr.envs.tasks.planar", 1000),
+    "Swimmer": ("sb3_gcr.envs.tasks.planar", 1000),
 }
 
 

@@ -21,16 +21,25 @@ def describe_statistics(vec_normalize: VecNormalize) -> dict[str, Any]:
 
     :param vec_normalize: the wrapper of a model's env
     """
-    observations = {key: _describe_moments(moments) for key, moments in _of_observations(vec_normalize).items()}
+    observations = {
+        key: _describe_moments(moments) for key, moments in _of_observations(vec_normalize).items()
+    }
     return {"observations": observations, "returns": _describe_moments(vec_normalize.ret_rms)}
 
 
 def _describe_moments(moments: RunningMeanStd) -> dict[str, Any]:
-    return {"mean": np.asarray(moments.mean).tolist(), "var": np.asarray(moments.var).tolist(), "count": float(moments.count)}
+    return {
+        "mean": np.asarray(moments.mean).tolist(),
+        "var": np.asarray(moments.var).tolist(),
+        "count": float(moments.count),
+    }
 
 
-def restore_statistics(vec_normalize: VecNormalize, saved: Mapping[str, Any], returns: bool = True) -> bool:
-    """Give saved statistics to a VecNormalize that has not seen anything yet; one that has keeps its own.
+def restore_statistics(
+    vec_normalize: VecNormalize, saved: Mapping[str, Any], returns: bool = True
+) -> bool:
+    """Give saved statistics to a VecNormalize that has not seen anything yet; one that has keeps
+    its own.
 
     :param vec_normalize: the wrapper of a model's env
     :param saved: of ``describe_statistics``
@@ -43,7 +52,8 @@ def restore_statistics(vec_normalize: VecNormalize, saved: Mapping[str, Any], re
         return False
     if observations and saved["observations"] and set(observations) != set(saved["observations"]):
         raise ValueError(
-            f"VecNormalize must normalise the observations that it did for the saved model, {sorted(saved['observations'])}, "
+            "VecNormalize must normalise the observations that it did for the saved model, "
+            f"{sorted(saved['observations'])}, "
             f"found {sorted(observations)}."
         )
     for key in set(observations) & set(saved["observations"]):
@@ -56,6 +66,9 @@ def restore_statistics(vec_normalize: VecNormalize, saved: Mapping[str, Any], re
 def _restore_moments(moments: RunningMeanStd, saved: Mapping[str, Any]) -> None:
     mean, var = (np.array(saved[name], dtype=np.float64) for name in ("mean", "var"))
     if mean.shape != np.shape(moments.mean) or var.shape != mean.shape:
-        raise ValueError(f"The saved statistics must have shape {np.shape(moments.mean)}, found {mean.shape} and {var.shape}.")
+        raise ValueError(
+            f"The saved statistics must have shape {np.shape(moments.mean)}, found {mean.shape} "
+            f"and {var.shape}."
+        )
     # 0-d arrays where VecNormalize has them, because SB3 pickles and compares them as they are.
     moments.mean, moments.var, moments.count = mean, var, float(saved["count"])

@@ -1,4 +1,6 @@
-"""What a new model keeps of an old one: the actor, the critic's hidden layers, and the value heads of the same name."""
+"""What a new model keeps of an old one: the actor, the critic's hidden layers, and the value heads
+of the same name.
+"""
 
 from __future__ import annotations
 
@@ -35,14 +37,20 @@ class WarmStart:
         :param path: the old model's file
         :param statistics: what became of VecNormalize's
         """
-        layers = "actor and critic kept" if self.critic else "actor kept, critic new (its layers differ)"
+        layers = (
+            "actor and critic kept" if self.critic else "actor kept, critic new (its layers differ)"
+        )
         heads = {"value heads kept": self.kept, "new": self.fresh, "left behind": self.left}
         listed = "; ".join(f"{what}: {', '.join(names) or 'none'}" for what, names in heads.items())
         return f"Warm start from {path}: {layers}; {listed}; {statistics}."
 
 
 def merge_parameters(
-    new: Parameters, old: Parameters, names: Sequence[str], old_names: Sequence[str], shares_extractor: bool
+    new: Parameters,
+    old: Parameters,
+    names: Sequence[str],
+    old_names: Sequence[str],
+    shares_extractor: bool,
 ) -> tuple[dict[str, th.Tensor], WarmStart]:
     """The parameters of a warm start.
 
@@ -50,22 +58,32 @@ def merge_parameters(
     :param old: the old policy's
     :param names: reward components of the new value heads
     :param old_names: of the old ones
-    :param shares_extractor: whether actor and critic of the new policy share their features extractor
+    :param shares_extractor: whether actor and critic of the new policy share their features
+        extractor
     :return: parameters for the new policy, and what was kept
     :raises ValueError: if the actors differ
     """
-    if shares_extractor:  # the entries of the critic are the actor's then; the old critic may have had its own
+    if (
+        shares_extractor
+    ):  # the entries of the critic are the actor's then; the old critic may have had its own
         old = {
-            key: old.get(key.replace("vf_features_extractor.", "pi_features_extractor."), value) for key, value in old.items()
+            key: old.get(key.replace("vf_features_extractor.", "pi_features_extractor."), value)
+            for key, value in old.items()
         }
     critic = HIDDEN if shares_extractor else (*HIDDEN, "vf_features_extractor.")
     is_actor = {key: not key.startswith(critic) for key in {**new, **old}}
-    differing = [key for key, actor in is_actor.items() if actor and _shape(new, key) != _shape(old, key)]
+    differing = [
+        key for key, actor in is_actor.items() if actor and _shape(new, key) != _shape(old, key)
+    ]
     if differing:
         listed = "; ".join(
-            f"{key} is {_shape(old, key)} in the file and {_shape(new, key)} in the new model" for key in differing
+            f"{key} is {_shape(old, key)} in the file and {_shape(new, key)} in the new model"
+            for key in differing
         )
-        raise ValueError(f"Parameter `policy_kwargs` must leave the actor as it was, found other layers: {listed}.")
+        raise ValueError(
+            "Parameter `policy_kwargs` must leave the actor as it was, found other layers: "
+            f"{listed}."
+        )
     merged = {key: old[key] if is_actor[key] else value.clone() for key, value in new.items()}
     hidden = [key for key, actor in is_actor.items() if not actor and key not in HEADS]
     keeps_critic = all(_shape(new, key) == _shape(old, key) for key in hidden) and all(
@@ -78,7 +96,9 @@ def merge_parameters(
             for name in kept:
                 merged[key][names.index(name)] = old[key][old_names.index(name)]
     fresh = tuple(name for name in names if name not in kept)
-    return merged, WarmStart(tuple(kept), fresh, tuple(name for name in old_names if name not in kept), keeps_critic)
+    return merged, WarmStart(
+        tuple(kept), fresh, tuple(name for name in old_names if name not in kept), keeps_critic
+    )
 
 
 def _shape(parameters: Parameters, key: str) -> str:

@@ -20,20 +20,15 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gcr.advantages import bootstrap_truncations
 from sb3_gcr.buffers import VectorDictRolloutBuffer, VectorRolloutBuffer
-from sb3_gcr.components import (
-    SCALAR_REWARD,
-    ComponentReader,
-    RewardSpec,
-    find_reward_spec,
-    match_specs,
-    undecomposed_id,
-)
-from sb3_gcr.diagnostics import component_table
+from sb3_gcr.logs.shown import component_table
 from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiHeadActorCriticPolicy, MultiInputPolicy
+from sb3_gcr.rewards.reading import ComponentReader, find_reward_spec, match_specs, undecomposed_id
+from sb3_gcr.rewards.spec import SCALAR_REWARD, RewardSpec
 
 
 class VectorPPO(PPO):
-    """SB3's PPO with a critic head and a return per reward component; the update is left to a subclass.
+    """SB3's PPO with a critic head and a return per reward component; the update is left to a
+    subclass.
 
     With one component, and nothing that asks for more, SB3's own code runs.
 
@@ -51,7 +46,9 @@ class VectorPPO(PPO):
     reward_spec: RewardSpec
 
     def __init__(self, *args: Any, **kwargs: Any):
-        self.ep_component_buffer: deque[NDArray[np.float64]] = deque(maxlen=kwargs.get("stats_window_size", 100))
+        self.ep_component_buffer: deque[NDArray[np.float64]] = deque(
+            maxlen=kwargs.get("stats_window_size", 100)
+        )
         self._episode_components: NDArray[np.float64] | None = None
         super().__init__(*args, **kwargs)
 
@@ -72,13 +69,18 @@ class VectorPPO(PPO):
         if self._is_plain_ppo:
             super()._setup_model()
             return
-        given = {name: getattr(self, name) for name in ("policy_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs")}
+        given = {
+            name: getattr(self, name)
+            for name in ("policy_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs")
+        }
         self._choose_vector_classes()
         super()._setup_model()
         self.__dict__.update(given)  # what a model saves is what its constructor was given
 
     def _adopt_reward_spec(self) -> None:
-        """Take over the env's spec, or check it against the one that a loaded model was made with."""
+        """Take over the env's spec, or check it against the one that a loaded model was made
+        with.
+        """
         found = None if self.env is None else find_reward_spec(self.env)
         if "reward_spec" in self.__dict__:
             self.reward_spec = match_specs(self.reward_spec, found)
@@ -87,8 +89,10 @@ class VectorPPO(PPO):
         env_id = None if self.env is None else undecomposed_id(self.env)
         if env_id is not None:
             warnings.warn(
-                f"'{env_id}' reports the terms of its reward, but nothing collects them, so GCRPPO trains one objective. "
-                "Add the line `env = RewardDecomposition(env)`, or `make_vec_env(..., wrapper_class=RewardDecomposition)`.",
+                f"'{env_id}' reports the terms of its reward, but nothing collects them, so GCRPPO "
+                "trains one objective. "
+                "Add the line `env = RewardDecomposition(env)`, or `make_vec_env(..., "
+                "wrapper_class=RewardDecomposition)`.",
                 stacklevel=2,
             )
 
@@ -104,10 +108,14 @@ class VectorPPO(PPO):
             self.rollout_buffer_class = VectorDictRolloutBuffer if is_dict else VectorRolloutBuffer
         elif not issubclass(self.rollout_buffer_class, VectorRolloutBuffer):
             raise ValueError(
-                "Parameter `rollout_buffer_class` must be a subclass of VectorRolloutBuffer for more than one reward "
+                "Parameter `rollout_buffer_class` must be a subclass of VectorRolloutBuffer for "
+                "more than one reward "
                 f"component, found {self.rollout_buffer_class.__name__}."
             )
-        self.rollout_buffer_kwargs = {**self.rollout_buffer_kwargs, "n_objectives": self.n_objectives}
+        self.rollout_buffer_kwargs = {
+            **self.rollout_buffer_kwargs,
+            "n_objectives": self.n_objectives,
+        }
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
@@ -118,7 +126,8 @@ class VectorPPO(PPO):
         super()._maybe_recommend_cpu(mlp_class_name)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """SB3's ``set_env``; the reward components must be those of the model, their order may differ.
+        """SB3's ``set_env``; the reward components must be those of the model, their order may
+        differ.
 
         :param env: the environment to learn from
         :param force_reset: reset it before training
@@ -143,15 +152,19 @@ class VectorPPO(PPO):
         assert self.env is not None
         if self.n_objectives > 1 and find_reward_spec(self.env) is None:
             raise ValueError(
-                f"The env reports no reward components, but the model has {self.n_objectives}: {self.reward_spec}. "
-                "Wrap it with `RewardDecomposition`, or set another with `set_env`; `predict` works without."
+                f"The env reports no reward components, but the model has {self.n_objectives}: "
+                f"{self.reward_spec}. "
+                "Wrap it with `RewardDecomposition`, or set another with `set_env`; `predict` "
+                "works without."
             )
         resets = reset_num_timesteps or self._last_obs is None
         if resets or self._episode_components is None:
             self._episode_components = np.zeros((self.env.num_envs, self.n_objectives))
         if reset_num_timesteps:
             self.ep_component_buffer = deque(maxlen=self._stats_window_size)
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        result = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
         self._reader = ComponentReader(self.env, self.reward_spec)
         if self.n_objectives > 1:
             self.logger.info(f"{self.n_objectives} reward components: {self.reward_spec}")
@@ -160,16 +173,22 @@ class VectorPPO(PPO):
         return result
 
     def collect_rollouts(
-        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
     ) -> bool:
-        """SB3's ``collect_rollouts`` with reward components; a callback's ``locals["values"]`` has shape (N, K).
+        """SB3's ``collect_rollouts`` with reward components; a callback's ``locals["values"]`` has
+        shape (N, K).
 
         :param env: training env
         :param callback: called at each step
         :param rollout_buffer: buffer to fill
         :param n_rollout_steps: number of steps per env
         :return: False if the callback stopped the rollout
-        :raises ValueError: if the components of a step are missing, not finite, or do not sum to the reward
+        :raises ValueError: if the components of a step are missing, not finite, or do not sum to
+            the reward
         """
         if self._is_plain_ppo:
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
@@ -198,7 +217,14 @@ class VectorPPO(PPO):
             self._update_info_buffer(infos, dones)
             n_steps += 1
             reward_components = self._bootstrap(reward_components, dones, infos)
-            rollout_buffer.add(self._last_obs, actions, reward_components, self._last_episode_starts, values, log_probs)  # type: ignore[arg-type]
+            rollout_buffer.add(
+                self._last_obs,  # type: ignore[arg-type]
+                actions,
+                reward_components,
+                self._last_episode_starts,  # type: ignore[arg-type]
+                values,
+                log_probs,
+            )
             self._last_obs = new_obs  # type: ignore[assignment]
             self._last_episode_starts = dones
         with th.no_grad():
@@ -216,7 +242,9 @@ class VectorPPO(PPO):
             return self.policy.unscale_action(actions)
         return np.clip(actions, self.action_space.low, self.action_space.high)
 
-    def _read_components(self, rewards: NDArray[Any], infos: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    def _read_components(
+        self, rewards: NDArray[Any], infos: Any
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
         if self.n_objectives == 1:  # a VecEnv may then return no infos at all
             return rewards[:, None], rewards[:, None]
         return self._reader.read(rewards, infos, self.num_timesteps)
@@ -228,22 +256,33 @@ class VectorPPO(PPO):
         self.ep_component_buffer.extend(self._episode_components[dones])
         self._episode_components[dones] = 0.0
 
-    def _bootstrap(self, components: NDArray[Any], dones: NDArray[np.bool_], infos: Any) -> NDArray[Any]:
-        """Add the value of the terminal observation where a time limit ended the episode, all of them in one forward pass."""
+    def _bootstrap(
+        self, components: NDArray[Any], dones: NDArray[np.bool_], infos: Any
+    ) -> NDArray[Any]:
+        """Add the value of the terminal observation where a time limit ended the episode, all of
+        them in one forward pass.
+        """
         truncated = np.zeros(len(dones), dtype=bool)
         for index in np.flatnonzero(dones):
             info = infos[index] if len(infos) else {}
-            truncated[index] = info.get("TimeLimit.truncated", False) and info.get("terminal_observation") is not None
+            truncated[index] = (
+                info.get("TimeLimit.truncated", False)
+                and info.get("terminal_observation") is not None
+            )
         if not truncated.any():
             return components
         terminal = [infos[index]["terminal_observation"] for index in np.flatnonzero(truncated)]
         if isinstance(terminal[0], dict):
-            observations: Any = {key: np.stack([row[key] for row in terminal]) for key in terminal[0]}
+            observations: Any = {
+                key: np.stack([row[key] for row in terminal]) for key in terminal[0]
+            }
         else:
             observations = np.stack(terminal)
         with th.no_grad():
             terminal_values = self.policy.predict_values(self.policy.obs_to_tensor(observations)[0])
-        return bootstrap_truncations(components, truncated, terminal_values.cpu().numpy(), self.gamma)
+        return bootstrap_truncations(
+            components, truncated, terminal_values.cpu().numpy(), self.gamma
+        )
 
     def dump_logs(self, iteration: int = 0) -> None:
         """Write SB3's log, with the return of each component, and our own table of components.
@@ -267,6 +306,7 @@ class VectorPPO(PPO):
 
 def _wrong_policy_message(name: str) -> str:
     return (
-        f"Parameter `policy` must be one of {sorted(VectorPPO.policy_aliases)} or a subclass of MultiHeadActorCriticPolicy, "
+        f"Parameter `policy` must be one of {sorted(VectorPPO.policy_aliases)} or a subclass of "
+        "MultiHeadActorCriticPolicy, "
         f"found {name!r}. Recurrent and maskable policies are not supported."
     )

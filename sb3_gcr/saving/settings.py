@@ -1,4 +1,6 @@
-"""A model's settings and spaces as plain JSON: what can be read back without unpickling anything."""
+"""A model's settings and spaces as plain JSON: what can be read back without unpickling
+anything.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,11 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
-from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy, MultiInputActorCriticPolicy
+from stable_baselines3.common.policies import (
+    ActorCriticCnnPolicy,
+    ActorCriticPolicy,
+    MultiInputActorCriticPolicy,
+)
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule
@@ -20,20 +26,69 @@ from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
 #: The arguments of ``GCRPPO`` that are settings.
 SETTINGS = (
-    *("learning_rate", "n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "clip_range", "clip_range_vf"),
-    *("normalize_advantage", "ent_coef", "vf_coef", "max_grad_norm", "use_sde", "sde_sample_freq", "rollout_buffer_class"),
-    *("rollout_buffer_kwargs", "target_kl", "stats_window_size", "tensorboard_log", "policy_kwargs", "verbose", "seed"),
-    *("resolver", "resolver_kwargs", "advantage_scope", "kappa_max", "desired_kl", "gramian_method", "gramian_samples"),
+    *(
+        "learning_rate",
+        "n_steps",
+        "batch_size",
+        "n_epochs",
+        "gamma",
+        "gae_lambda",
+        "clip_range",
+        "clip_range_vf",
+    ),
+    *(
+        "normalize_advantage",
+        "ent_coef",
+        "vf_coef",
+        "max_grad_norm",
+        "use_sde",
+        "sde_sample_freq",
+        "rollout_buffer_class",
+    ),
+    *(
+        "rollout_buffer_kwargs",
+        "target_kl",
+        "stats_window_size",
+        "tensorboard_log",
+        "policy_kwargs",
+        "verbose",
+        "seed",
+    ),
+    *(
+        "resolver",
+        "resolver_kwargs",
+        "advantage_scope",
+        "kappa_max",
+        "desired_kl",
+        "gramian_method",
+        "gramian_samples",
+    ),
 )
 #: Those that a file of somebody else has no say in: where to write, and a class.
 PRIVATE = ("tensorboard_log", "rollout_buffer_class")
 #: SB3's policies and ours, by the name that ``GCRPPO(policy)`` takes.
 POLICIES: dict[type[Any], str] = {
     **{MlpPolicy: "MlpPolicy", CnnPolicy: "CnnPolicy", MultiInputPolicy: "MultiInputPolicy"},
-    **{ActorCriticPolicy: "MlpPolicy", ActorCriticCnnPolicy: "CnnPolicy", MultiInputActorCriticPolicy: "MultiInputPolicy"},
+    **{
+        ActorCriticPolicy: "MlpPolicy",
+        ActorCriticCnnPolicy: "CnnPolicy",
+        MultiInputActorCriticPolicy: "MultiInputPolicy",
+    },
 }
 #: The classes that ``policy_kwargs`` may name.
-_ACTIVATIONS = (nn.Tanh, nn.ReLU, nn.ELU, nn.SELU, nn.CELU, nn.GELU, nn.SiLU, nn.Mish, nn.LeakyReLU, nn.Sigmoid, nn.Softplus)
+_ACTIVATIONS = (
+    nn.Tanh,
+    nn.ReLU,
+    nn.ELU,
+    nn.SELU,
+    nn.CELU,
+    nn.GELU,
+    nn.SiLU,
+    nn.Mish,
+    nn.LeakyReLU,
+    nn.Sigmoid,
+    nn.Softplus,
+)
 _OPTIMISERS = (th.optim.Adam, th.optim.AdamW, th.optim.SGD, th.optim.RMSprop, RMSpropTFLike)
 CLASSES: dict[str, dict[str, type[Any]]] = {
     name: {cls.__name__: cls for cls in classes}
@@ -51,7 +106,10 @@ def collect_settings(attributes: Mapping[str, Any]) -> dict[str, Any]:
     :param attributes: of a model, or of the file of one
     """
     found = {name: attributes[key] for name in SETTINGS if (key := _attribute(name)) in attributes}
-    if found.get("rollout_buffer_class") in (RolloutBuffer, DictRolloutBuffer):  # SB3's choice for one objective
+    if found.get("rollout_buffer_class") in (
+        RolloutBuffer,
+        DictRolloutBuffer,
+    ):  # SB3's choice for one objective
         found["rollout_buffer_class"] = None
     for name in ("learning_rate", "clip_range", "clip_range_vf"):
         if isinstance(found.get(name), FloatSchedule):
@@ -100,7 +158,11 @@ def describe_object(value: Any) -> str:
     """What an object is, for people: "class Policy", "function warm_up", "Schedule object"."""
     if isinstance(value, type):
         return f"class {value.__qualname__}"
-    return f"function {value.__qualname__}" if hasattr(value, "__qualname__") else f"{type(value).__name__} object"
+    return (
+        f"function {value.__qualname__}"
+        if hasattr(value, "__qualname__")
+        else f"{type(value).__name__} object"
+    )
 
 
 def to_plain(value: Any) -> Any:
@@ -135,7 +197,10 @@ def parse_settings(plain: Mapping[str, Any]) -> dict[str, Any]:
         for key in set(settings["policy_kwargs"]) & set(CLASSES):
             name = settings["policy_kwargs"][key]
             if not isinstance(name, str) or name not in CLASSES[key]:
-                raise ValueError(f"`policy_kwargs[{key!r}]` in a file must be one of {sorted(CLASSES[key])}, found {name!r}.")
+                raise ValueError(
+                    f"`policy_kwargs[{key!r}]` in a file must be one of {sorted(CLASSES[key])}, "
+                    f"found {name!r}."
+                )
             settings["policy_kwargs"][key] = CLASSES[key][name]
     return settings
 
@@ -150,13 +215,21 @@ def describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
         return {"type": kind, "spaces": {key: describe_space(item) for key, item in space.items()}}
     if isinstance(space, spaces.Box):
         bounds = {"low": _shorten(space.low), "high": _shorten(space.high)}
-        return {"type": kind, "shape": list(space.shape), "dtype": np.dtype(space.dtype).name, **bounds}
+        return {
+            "type": kind,
+            "shape": list(space.shape),
+            "dtype": np.dtype(space.dtype).name,
+            **bounds,
+        }
     if isinstance(space, spaces.Discrete):
         return {"type": kind, "n": int(space.n), "start": int(space.start)}
     if isinstance(space, spaces.MultiDiscrete):
         return {"type": kind, "nvec": space.nvec.tolist()}
     if isinstance(space, spaces.MultiBinary):
-        return {"type": kind, "n": list(space.n) if isinstance(space.n, tuple | list) else int(space.n)}
+        return {
+            "type": kind,
+            "n": list(space.n) if isinstance(space.n, tuple | list) else int(space.n),
+        }
     return {"type": kind, "text": repr(space)}
 
 
@@ -173,10 +246,20 @@ def find_differences(saved: Any, found: Any, name: str) -> list[str]:
     :param found: of the env
     :param name: what is described
     """
-    if isinstance(saved, dict) and isinstance(found, dict) and saved.get("type") == found.get("type"):
+    if (
+        isinstance(saved, dict)
+        and isinstance(found, dict)
+        and saved.get("type") == found.get("type")
+    ):
         keys = {**saved, **found}
-        pairs = [(saved.get(key, "missing"), found.get(key, "missing"), f"{name}.{key}") for key in keys]
+        pairs = [
+            (saved.get(key, "missing"), found.get(key, "missing"), f"{name}.{key}") for key in keys
+        ]
         return [line for pair in pairs for line in find_differences(*pair)]
     if isinstance(saved, dict) and isinstance(found, dict):
         return find_differences(saved["type"], found["type"], f"{name}.type")
-    return [] if saved == found else [f"{name} is {reprlib.repr(saved)} in the file and {reprlib.repr(found)} in the env"]
+    return (
+        []
+        if saved == found
+        else [f"{name} is {reprlib.repr(saved)} in the file and {reprlib.repr(found)} in the env"]
+    )

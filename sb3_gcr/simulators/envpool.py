@@ -1,4 +1,6 @@
-"""EnvPool's MuJoCo and Playground envs, C++ threads on the CPU, as a VecEnv that reports its reward components."""
+"""EnvPool's MuJoCo and Playground envs, C++ threads on the CPU, as a VecEnv that reports its reward
+components.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_gcr.components import Level, RewardSpec
+from sb3_gcr.rewards.spec import Level, RewardSpec
 
 
 def _levels(task: str, regulariser: str) -> dict[str, Level]:
@@ -25,12 +27,15 @@ def _levels(task: str, regulariser: str) -> dict[str, Level]:
 
 _G1 = _levels(
     "tracking_lin_vel tracking_ang_vel termination alive",
-    "lin_vel_z ang_vel_xy orientation base_height torques action_rate energy dof_acc feet_clearance feet_air_time feet_slip "
-    "feet_height feet_phase stand_still collision contact_force joint_deviation_knee joint_deviation_hip dof_pos_limits pose",
+    "lin_vel_z ang_vel_xy orientation base_height torques action_rate energy dof_acc "
+    "feet_clearance feet_air_time feet_slip "
+    "feet_height feet_phase stand_still collision contact_force joint_deviation_knee "
+    "joint_deviation_hip dof_pos_limits pose",
 )
 _GO1 = _levels(
     "tracking_lin_vel tracking_ang_vel termination",
-    "lin_vel_z ang_vel_xy orientation dof_pos_limits pose stand_still torques action_rate energy feet_clearance feet_height "
+    "lin_vel_z ang_vel_xy orientation dof_pos_limits pose stand_still torques action_rate energy "
+    "feet_clearance feet_height "
     "feet_slip feet_air_time",
 )
 #: Levels by info key of the envs whose reward is known to be the sum of these terms.
@@ -55,33 +60,50 @@ ENVPOOL_ENVS: dict[str, dict[str, Level]] = {
         "tracking termination alive",
         "lin_vel_z ang_vel_xy orientation feet_phase torques action_rate energy collision pose",
     ),
-    "LeapCubeReorient-v1": _levels("orientation position success termination", "hand_pose joint_vel action_rate energy"),
+    "LeapCubeReorient-v1": _levels(
+        "orientation position success termination", "hand_pose joint_vel action_rate energy"
+    ),
     "PandaPickCube-v1": _levels("gripper_box box_target", "no_floor_collision robot_target_qpos"),
-    "PandaOpenCabinet-v1": _levels("gripper_box box_target", "no_barrier_collision robot_target_qpos"),
+    "PandaOpenCabinet-v1": _levels(
+        "gripper_box box_target", "no_barrier_collision robot_target_qpos"
+    ),
 }
 #: EnvPool's settings that are this adapter's own.
-_OWN_SETTINGS = {"num_envs", "batch_size", "num_threads", "max_num_players", "seed", "env_seed", "gym_reset_return_info"}
+_OWN_SETTINGS = {
+    "num_envs",
+    "batch_size",
+    "num_threads",
+    "max_num_players",
+    "seed",
+    "env_seed",
+    "gym_reset_return_info",
+}
 
 
 class EnvPoolVecEnv(VecEnv):
-    """N EnvPool envs stepped by C++ threads, with ``reward_components`` of shape (N, K) after each step.
+    """N EnvPool envs stepped by C++ threads, with ``reward_components`` of shape (N, K) after each
+    step.
 
-    Finished envs are reset within the step that ended them. The infos of running envs are empty; that of a finished one has
-    ``terminal_observation``, ``TimeLimit.truncated``, what EnvPool reports, and SB3's ``episode`` statistics with the return
-    of each component as ``r_<name>``. The components are what the terms of the info add to the reward: where EnvPool reports
-    them before a factor (the time step, a weight), they are multiplied by it. Playground robots whose reward is
-    max(Σ terms, 0) are paid Σ terms, negative too, because a clipped sum has no components. The pool is made at the first
-    ``reset``, and made anew at the ``reset`` that follows ``seed``, because EnvPool's seeds are fixed at construction.
+    Finished envs are reset within the step that ended them. The infos of running envs are empty;
+    that of a finished one has ``terminal_observation``, ``TimeLimit.truncated``, what EnvPool
+    reports, and SB3's ``episode`` statistics with the return of each component as ``r_<name>``. The
+    components are what the terms of the info add to the reward: where EnvPool reports them before a
+    factor (the time step, a weight), they are multiplied by it. Playground robots whose reward is
+    max(Σ terms, 0) are paid Σ terms, negative too, because a clipped sum has no components. The
+    pool is made at the first ``reset``, and made anew at the ``reset`` that follows ``seed``,
+    because EnvPool's seeds are fixed at construction.
 
     :param env_id: an id of ``ENVPOOL_ENVS``, or another of EnvPool's with ``components``
     :param num_envs: number N of envs
     :param num_threads: number of C++ threads; None takes one per processor, but not more than envs
     :param seed: env i gets ``seed + i``; None draws one
-    :param components: levels by info key, e.g. ``{"reward_run": "task", "reward_ctrl": "regulariser"}``; None looks the env
-        up in ``ENVPOOL_ENVS`` and leaves out the terms whose weight is 0 in its settings
-    :param residual: name of a component for the rest of EnvPool's reward, clipped or not; a task; ``{name: level}`` for
-        another level
-    :param envpool_kwargs: settings of the env, e.g. ``max_episode_steps=500`` or ``action_rate_scale=-0.01``
+    :param components: levels by info key, e.g. ``{"reward_run": "task", "reward_ctrl":
+        "regulariser"}``; None looks the env up in ``ENVPOOL_ENVS`` and leaves out the terms whose
+        weight is 0 in its settings
+    :param residual: name of a component for the rest of EnvPool's reward, clipped or not; a task;
+        ``{name: level}`` for another level
+    :param envpool_kwargs: settings of the env, e.g. ``max_episode_steps=500`` or
+        ``action_rate_scale=-0.01``
     :raises ImportError: if EnvPool is not installed
     """
 
@@ -112,7 +134,9 @@ class EnvPoolVecEnv(VecEnv):
         self._is_clipped, self._has_residual = "ctrl_dt" in config, residual is not None
         rest = {residual: "task"} if isinstance(residual, str) else residual or {}
         if not isinstance(rest, Mapping) or (self._has_residual and len(rest) != 1):
-            raise ValueError(f"Parameter `residual` must be a name or {{name: level}}, found {residual!r}.")
+            raise ValueError(
+                f"Parameter `residual` must be a name or {{name: level}}, found {residual!r}."
+            )
         self.reward_spec = RewardSpec((*levels, *rest), (*levels.values(), *rest.values()))  # type: ignore[arg-type]
         self.reward_components = np.zeros((num_envs, len(self.reward_spec)))
         self._episode_returns = self.reward_components.copy()
@@ -128,7 +152,8 @@ class EnvPoolVecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seeds of the pool that the next ``reset`` makes.
 
-        :param seed: env i gets ``seed + i``; None draws one. EnvPool's seeds end below 2³¹, so it is taken modulo 2³¹ - N
+        :param seed: env i gets ``seed + i``; None draws one. EnvPool's seeds end below 2³¹, so it
+            is taken modulo 2³¹ - N
         :return: the seed of each env
         """
         largest = 2**31 - self.num_envs
@@ -148,10 +173,13 @@ class EnvPoolVecEnv(VecEnv):
             self.close()
             self._pool_seeds = self._seeds
         if self._pool is None:
-            # We count the time limit: EnvPool would call a fall in the last step of the limit a truncation.
+            # We count the time limit: EnvPool would call a fall in the last step of the limit a
+            # truncation.
             settings = {**self._settings, "max_episode_steps": self.max_episode_steps + 1}
             threads = {"num_envs": self.num_envs, "num_threads": self.num_threads or 0}
-            self._pool = self._envpool.make(self.env_id, "gymnasium", seed=self._pool_seeds, **threads, **settings)
+            self._pool = self._envpool.make(
+                self.env_id, "gymnasium", seed=self._pool_seeds, **threads, **settings
+            )
         self._reset_seeds()
         self._reset_options()
         self._waiting = False
@@ -169,7 +197,9 @@ class EnvPoolVecEnv(VecEnv):
             raise RuntimeError("EnvPoolVecEnv must be reset before a step.")
         expected = (self.num_envs, *(self.action_space.shape or ()))
         if np.shape(actions) != expected:
-            raise ValueError(f"Parameter `actions` must have shape {expected}, found {np.shape(actions)}.")
+            raise ValueError(
+                f"Parameter `actions` must have shape {expected}, found {np.shape(actions)}."
+            )
         self._pool.send(np.asarray(actions))
         self._waiting = True
 
@@ -190,7 +220,9 @@ class EnvPoolVecEnv(VecEnv):
         if dones.any():
             for index in np.flatnonzero(dones):
                 infos[index] = self._finish(index, observations, info)
-                infos[index]["TimeLimit.truncated"] = bool(truncated[index] and not terminated[index])
+                infos[index]["TimeLimit.truncated"] = bool(
+                    truncated[index] and not terminated[index]
+                )
             self._episode_returns[dones] = 0.0
             # EnvPool itself would reset in the next step, and pay a dummy transition for it.
             starts, reset_info = self._pool.reset(options={"reset_mask": dones})
@@ -212,11 +244,17 @@ class EnvPoolVecEnv(VecEnv):
         return rewards
 
     def _finish(self, index: Any, observations: Any, info: dict[str, Any]) -> dict[str, Any]:
-        """The info of an env that has finished its episode; copies, because the reset overwrites the observation."""
+        """The info of an env that has finished its episode; copies, because the reset overwrites
+        the observation.
+        """
         returns = self._episode_returns[index].round(6).tolist()
-        row = {key: value[index].copy() for key, value in info.items() if isinstance(value, np.ndarray)}
+        row = {
+            key: value[index].copy() for key, value in info.items() if isinstance(value, np.ndarray)
+        }
         if isinstance(observations, dict):
-            row["terminal_observation"] = {key: value[index].copy() for key, value in observations.items()}
+            row["terminal_observation"] = {
+                key: value[index].copy() for key, value in observations.items()
+            }
         else:
             row["terminal_observation"] = observations[index].copy()
         by_key = dict(zip(self.reward_spec.return_keys, returns, strict=True))
@@ -241,11 +279,18 @@ class EnvPoolVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> NoReturn:
         """Not possible: the envs live in C++."""
-        raise NotImplementedError(f"EnvPool's envs take their settings at construction: EnvPoolVecEnv(..., {attr_name}=...).")
+        raise NotImplementedError(
+            "EnvPool's envs take their settings at construction: EnvPoolVecEnv(..., "
+            f"{attr_name}=...)."
+        )
 
-    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> NoReturn:
+    def env_method(
+        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
+    ) -> NoReturn:
         """Not possible: the envs live in C++."""
-        raise NotImplementedError(f"EnvPool's envs have no Python methods, found a call of {method_name!r}.")
+        raise NotImplementedError(
+            f"EnvPool's envs have no Python methods, found a call of {method_name!r}."
+        )
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """True for SB3's Monitor, whose statistics are in the infos."""
@@ -256,7 +301,9 @@ def _import_envpool() -> Any:
     try:
         return importlib.import_module("envpool")
     except ImportError:
-        message = "EnvPoolVecEnv needs EnvPool (Python 3.11 or newer): pip install 'sb3_gcr[envpool]'"
+        message = (
+            "EnvPoolVecEnv needs EnvPool (Python 3.11 or newer): pip install 'sb3_gcr[envpool]'"
+        )
         raise ImportError(message) from None
 
 
@@ -269,20 +316,28 @@ def _make_spec(envpool: Any, env_id: str, settings: dict[str, Any]) -> Any:
     """EnvPool's description of the env, without making one."""
     if env_id not in envpool.list_all_envs():
         raise ValueError(
-            f"Parameter `env_id` must be an id of EnvPool, found {env_id!r}: valid choices are {sorted(ENVPOOL_ENVS)}, "
+            f"Parameter `env_id` must be an id of EnvPool, found {env_id!r}: valid choices are "
+            f"{sorted(ENVPOOL_ENVS)}, "
             "and with `components` others of `envpool.list_all_envs()`."
         )
     valid = set(envpool.make_spec(env_id).config._asdict()) - _OWN_SETTINGS
     for name in sorted(settings):
         if name not in valid:
-            raise TypeError(f"'{env_id}' has no setting `{name}`: valid choices are {sorted(valid)}.")
+            raise TypeError(
+                f"'{env_id}' has no setting `{name}`: valid choices are {sorted(valid)}."
+            )
     try:
         return envpool.make_spec(env_id, **settings)
     except TypeError:
-        raise TypeError(f"EnvPool's settings of '{env_id}' must have the types of their defaults, found {settings}.") from None
+        raise TypeError(
+            f"EnvPool's settings of '{env_id}' must have the types of their defaults, found "
+            f"{settings}."
+        ) from None
 
 
-def _choose_components(env_id: str, components: Mapping[str, Level] | None, spec: Any) -> dict[str, Level]:
+def _choose_components(
+    env_id: str, components: Mapping[str, Level] | None, spec: Any
+) -> dict[str, Level]:
     """Levels by info key, checked against what the env reports."""
     numbers = sorted(
         key.removeprefix("info:")
@@ -294,12 +349,14 @@ def _choose_components(env_id: str, components: Mapping[str, Level] | None, spec
         terms = [key for key in numbers if "reward" in key]
         if known is None and not terms:
             raise ValueError(
-                f"Parameter `env_id` must be an env that reports the terms of its reward, found {env_id!r}: "
+                "Parameter `env_id` must be an env that reports the terms of its reward, found "
+                f"{env_id!r}: "
                 f"valid choices are {sorted(ENVPOOL_ENVS)}."
             )
         if known is None:
             raise ValueError(
-                f"Parameter `components` must be given for '{env_id}': levels are known only for {sorted(ENVPOOL_ENVS)}. "
+                f"Parameter `components` must be given for '{env_id}': levels are known only for "
+                f"{sorted(ENVPOOL_ENVS)}. "
                 f"The terms in its info are {terms}."
             )
         config = spec.config._asdict()
@@ -307,7 +364,10 @@ def _choose_components(env_id: str, components: Mapping[str, Level] | None, spec
     RewardSpec.from_dict(components)
     for key in components:
         if key not in numbers:
-            raise ValueError(f"Parameter `components` must name keys of the info, found {key!r}: valid choices are {numbers}.")
+            raise ValueError(
+                f"Parameter `components` must name keys of the info, found {key!r}: valid choices "
+                f"are {numbers}."
+            )
     return dict(components)
 
 
@@ -321,7 +381,9 @@ def _factor(key: str, config: dict[str, Any]) -> float:
     """What EnvPool multiplies a term of its info by before it adds it to the reward."""
     if "ctrl_dt" not in config:  # Gymnasium's envs report what they add
         return 1.0
-    if config["task_name"].startswith("Panda") or key == "reward_success":  # reported raw, and not times the time step
+    if (
+        config["task_name"].startswith("Panda") or key == "reward_success"
+    ):  # reported raw, and not times the time step
         scale = _scale(key, config)
         return 1.0 if scale is None else float(scale)
     return float(config["ctrl_dt"])

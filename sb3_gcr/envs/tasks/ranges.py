@@ -23,7 +23,8 @@ def choose_ranges(
     for name, index in chosen.items():
         if index is not None and (isinstance(index, bool) or index not in range(len(ranges[name]))):
             raise ValueError(
-                f"Parameter `{name}` must be None or the index of one of {dict(enumerate(ranges[name]))}, found {index!r}."
+                f"Parameter `{name}` must be None or the index of one of "
+                f"{dict(enumerate(ranges[name]))}, found {index!r}."
             )
     return {name: ranges[name][index] for name, index in chosen.items() if index is not None}
 

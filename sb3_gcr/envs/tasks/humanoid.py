@@ -1,6 +1,8 @@
-"""Humanoid-MO: run towards a point far away and, if wanted, keep power, strides, pelvis and hands in chosen ranges.
+"""Humanoid-MO: run towards a point far away and, if wanted, keep power, strides, pelvis and hands
+in chosen ranges.
 
-The base task is that of the paper (its reward, control rate, time limit and fall), on Gymnasium's humanoid.
+The base task is that of the paper (its reward, control rate, time limit and fall), on Gymnasium's
+humanoid.
 """
 
 from __future__ import annotations
@@ -13,10 +15,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_gcr.components import RewardSpec
-from sb3_gcr.envs.geometry import into_frame, wrap, yaw_and_roll
-from sb3_gcr.envs.objectives import choose_ranges, inside
 from sb3_gcr.envs.task import Array, Rows, Task, unbounded
+from sb3_gcr.envs.tasks.geometry import into_frame, wrap, yaw_and_roll
+from sb3_gcr.envs.tasks.ranges import choose_ranges, inside
+from sb3_gcr.rewards.spec import RewardSpec
 
 #: Physics step [s] and steps per control step: 60 Hz control.
 TIMESTEP, N_SUBSTEPS = 1 / 240, 4
@@ -36,13 +38,26 @@ CONTACT_FORCE = 1.0
 RANGES: dict[str, tuple[tuple[float, float], ...]] = {
     "energy": ((25, 50), (50, 100), (100, 200), (200, 400), (400, 800)),  # mechanical power [W]
     "gait": ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0)),  # stride [m]
-    "baseh": ((0.40, 0.55), (0.55, 0.70), (0.70, 0.82), (0.82, 0.95), (0.95, 1.20)),  # height of the pelvis [m]
-    "armsp": ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0)),  # distance from hand to pelvis [m]
+    "baseh": (
+        (0.40, 0.55),
+        (0.55, 0.70),
+        (0.70, 0.82),
+        (0.82, 0.95),
+        (0.95, 1.20),
+    ),  # height of the pelvis [m]
+    "armsp": (
+        (0.0, 0.2),
+        (0.2, 0.4),
+        (0.4, 0.6),
+        (0.6, 0.8),
+        (0.8, 1.0),
+    ),  # distance from hand to pelvis [m]
 }
 
 
 def progress(distance_before: Array, distance: Array) -> Array:
-    """120/s times the way made towards the target in this step, which is twice the speed towards it in m/s.
+    """120/s times the way made towards the target in this step, which is twice the speed towards it
+    in m/s.
 
     :param distance_before: to the target before the step [m]
     :param distance: after the step [m]
@@ -67,7 +82,8 @@ def upright(up: Array) -> Array:
 
 
 def move_to_target(heading: Array) -> Array:
-    """0.5 while the torso faces the target within 37° (heading > 0.8), and in proportion to its heading otherwise.
+    """0.5 while the torso faces the target within 37° (heading > 0.8), and in proportion to its
+    heading otherwise.
 
     :param heading: part of the torso's unit vector forward that points at the target
     """
@@ -111,7 +127,8 @@ def energy_range(power: Array, bounds: tuple[float, float]) -> Array:
 def gait_range(strides: Array, air_times: Array, bounds: tuple[float, float]) -> Array:
     """250/s times the time in the air of each foot that touches down now with a stride in range.
 
-    :param strides: between the last two touchdowns of each foot, NaN unless it touches down now [m], shape (N, 2)
+    :param strides: between the last two touchdowns of each foot, NaN unless it touches down now
+        [m], shape (N, 2)
     :param air_times: how long each foot was in the air [s], shape (N, 2)
     :param bounds: lower one included, upper one excluded [m]
     """
@@ -137,7 +154,9 @@ def armsp_range(distances: Array, bounds: tuple[float, float]) -> Array:
 
 
 class HumanoidRun(Task):
-    """Gymnasium's humanoid runs towards a point 1000 m ahead; seven terms, with the paper's weights and levels."""
+    """Gymnasium's humanoid runs towards a point 1000 m ahead; seven terms, with the paper's weights
+    and levels.
+    """
 
     n_substeps = N_SUBSTEPS
 
@@ -196,7 +215,9 @@ class HumanoidRun(Task):
         return s.qpos[:, 2] < FALLEN_HEIGHT
 
     def observe(self, s: Rows) -> Array:
-        """Torso height, velocities in the torso's frame, attitude, joint positions and velocities, last action."""
+        """Torso height, velocities in the torso's frame, attitude, joint positions and velocities,
+        last action.
+        """
         height, quaternion = s.qpos[:, 2:3], s.qpos[:, 3:7]
         up, heading = torso_projections(s.qpos)
         yaw, roll = yaw_and_roll(quaternion)
@@ -228,7 +249,8 @@ class HumanoidRun(Task):
 class HumanoidMO(HumanoidRun):
     """HumanoidRun with up to four objectives that pay inside a range; None leaves an objective out.
 
-    With ``energy`` given, the base term of that name is left out, because the two contradict each other.
+    With ``energy`` given, the base term of that name is left out, because the two contradict each
+    other.
 
     :param energy: index of the range of the mechanical power, 0 to 4
     :param gait: index of the range of the stride
@@ -237,19 +259,34 @@ class HumanoidMO(HumanoidRun):
     :raises ValueError: for an index that is not there
     """
 
-    def __init__(self, energy: int | None = None, gait: int | None = None, baseh: int | None = None, armsp: int | None = None):
+    def __init__(
+        self,
+        energy: int | None = None,
+        gait: int | None = None,
+        baseh: int | None = None,
+        armsp: int | None = None,
+    ):
         super().__init__()
         chosen = {"energy": energy, "gait": gait, "baseh": baseh, "armsp": armsp}
         self.ranges = choose_ranges(RANGES, chosen)
         base = {name: level for name, level in self.reward_spec if name not in self.ranges}
         self._kept = [index for index, name in enumerate(self.reward_spec.names) if name in base]
-        self.reward_spec = RewardSpec.from_dict({**base, **{f"{name}_range": "task" for name in self.ranges}})
+        self.reward_spec = RewardSpec.from_dict(
+            {**base, **{f"{name}_range": "task" for name in self.ranges}}
+        )
         self.fields = (*self.fields, "xpos", "geom_xpos", "sensordata")
         feet = len(FEET)
-        self.memory |= {"grounded": (feet,), "air_time": (feet,), "has_stepped": (feet,), "step_xy": (feet, 2)}
+        self.memory |= {
+            "grounded": (feet,),
+            "air_time": (feet,),
+            "has_stepped": (feet,),
+            "step_xy": (feet, 2),
+        }
         self.memory |= {"strides": (feet,), "last_air_time": (feet,)}
         self._pelvis = self.model.body("pelvis").id
-        self._feet, self._hands = ([self.model.geom(name).id for name in names] for names in (FEET, HANDS))
+        self._feet, self._hands = (
+            [self.model.geom(name).id for name in names] for names in (FEET, HANDS)
+        )
         self._gear = self.model.actuator_gear[:, 0]
 
     def measure(self, s: Rows) -> None:
@@ -274,7 +311,9 @@ class HumanoidMO(HumanoidRun):
             "baseh": lambda bounds: baseh_range(s.xpos[:, self._pelvis, 2], bounds),
             "armsp": lambda bounds: armsp_range(self.hand_distances(s), bounds),
         }
-        return [base[index] for index in self._kept] + [terms[name](bounds) for name, bounds in self.ranges.items()]
+        return [base[index] for index in self._kept] + [
+            terms[name](bounds) for name, bounds in self.ranges.items()
+        ]
 
     def power(self, s: Rows) -> Array:
         """Mechanical power Σ abs(τ q̇) [W], shape (N,)."""
@@ -287,7 +326,9 @@ class HumanoidMO(HumanoidRun):
 
 def humanoid_model() -> mujoco.MjModel:
     """Gymnasium's humanoid with an implicit integrator, and a touch sensor around each foot."""
-    spec = mujoco.MjSpec.from_file(str(Path(gymnasium.__file__).parent / "envs/mujoco/assets/humanoid.xml"))
+    spec = mujoco.MjSpec.from_file(
+        str(Path(gymnasium.__file__).parent / "envs/mujoco/assets/humanoid.xml")
+    )
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.timestep = TIMESTEP
     spec.geom("floor").size = [0, 0, 0.125]  # drawn without an end, in squares of 1 m
@@ -296,7 +337,9 @@ def humanoid_model() -> mujoco.MjModel:
     for name in FEET:
         foot = spec.geom(name)
         foot.parent.add_site(name=name, pos=foot.pos, size=[1.1 * foot.size[0], 0, 0], group=4)
-        spec.add_sensor(type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=name)
+        spec.add_sensor(
+            type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=name
+        )
     return spec.compile()
 
 
@@ -309,7 +352,8 @@ def distance_to_target(qpos: Array) -> Array:
 
 
 def torso_projections(qpos: Array) -> tuple[Array, Array]:
-    """Vertical part of the torso's unit vector up, and the part of its unit vector forward towards the target, each (N,).
+    """Vertical part of the torso's unit vector up, and the part of its unit vector forward towards
+    the target, each (N,).
 
     :param qpos: shape (N, 24)
     """

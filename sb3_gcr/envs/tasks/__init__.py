@@ -1,0 +1,1 @@
+"""The tasks, one robot a file; ``catalogue`` lists them."""

@@ -1,0 +1,1 @@
+"""One gradient per component, and their Gramian."""

@@ -1,0 +1,1 @@
+"""What training says of itself: logged figures, what is shown of them, and a report of a run."""

@@ -1,0 +1,1 @@
+"""Simulators made by others, as VecEnvs of Stable-Baselines3 with reward components."""
