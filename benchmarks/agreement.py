@@ -15,10 +15,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gcr import GCRPPO, RESOLVERS, RewardDecomposition
 from sb3_gcr.advantages import normalize_jointly
-from sb3_gcr.gradients.by_hand import OneBackward
+from sb3_gcr.angles import conflicts
+from sb3_gcr.gradients.by_hand import ByHand
 from sb3_gcr.logs.shown import format_table
 from sb3_gcr.losses import surrogate_cotangents
-from sb3_gcr.resolvers import conflicts
 
 SIZES = (64, 128, 256, 512, 1024)
 BATCH = 2048
@@ -44,14 +44,15 @@ class Agreement(BaseCallback):
         advantages, observations, actions, log_probs = (
             th.as_tensor(buffer.swap_and_flatten(array)[rows])
             for array in (
-                normalize_jointly(buffer.advantages),
+                normalize_jointly(buffer.advantages).advantages,
                 buffer.observations,
                 buffer.actions,
                 buffer.log_probs,
             )
         )
-        networks = OneBackward(model.policy).evaluate(observations, actions)
-        cotangents = surrogate_cotangents(networks.log_prob, log_probs.flatten(), advantages, 0.2)
+        networks = ByHand(model.policy)
+        _, log_prob = networks.evaluate(observations, actions)
+        cotangents = surrogate_cotangents(log_prob, log_probs.flatten(), advantages, 0.2)
         gramian = networks.gramian(cotangents).double().numpy()
         exact = RESOLVERS["gcr"](gramian, levels, np.random.default_rng(0))
         for size in SIZES:

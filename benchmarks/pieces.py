@@ -13,7 +13,7 @@ import torch as th
 from benchmarks.rollouts import Setting, evaluate, fill_buffer, make_model, make_rollout
 from benchmarks.updates import LARGE_2048, SMALL, SMALL_256
 from sb3_gcr import GCRPPO, RESOLVERS
-from sb3_gcr.gradients.by_hand import OneBackward
+from sb3_gcr.gradients.by_hand import ByHand
 from sb3_gcr.logs.shown import format_table
 from sb3_gcr.losses import surrogate_cotangents, value_cotangents
 
@@ -43,24 +43,25 @@ def pieces(setting: Setting, n_components: int) -> dict[str, float]:
     rollout = make_rollout(setting, n_components)
     fill_buffer(model.rollout_buffer, rollout, *evaluate(model.policy, rollout))
     batch = next(iter(model.rollout_buffer.get(setting.batch_size)))
-    networks = OneBackward(model.policy, setting.batch_size).evaluate(
-        batch.observations, batch.actions
-    )
+    networks = ByHand(model.policy, setting.batch_size)
+    values, log_prob = networks.evaluate(batch.observations, batch.actions)
     old_values, returns = networks.array(batch.old_values), networks.array(batch.returns)
     arguments = (networks.array(batch.old_log_prob), networks.array(batch.advantages), 0.2)
-    cotangents = surrogate_cotangents(networks.log_prob, *arguments)
-    value_gradients = value_cotangents(networks.values, old_values, returns, None)
+    cotangents = surrogate_cotangents(log_prob, *arguments)
+    value_gradients = value_cotangents(values, old_values, returns, None)
     gramian = np.asarray(networks.gramian(cotangents), dtype=float)
     levels, rng = np.array(model.reward_spec.levels), np.random.default_rng(0)
 
-    def derivatives() -> None:
-        surrogate_cotangents(networks.log_prob, *arguments)
-        value_cotangents(networks.values, old_values, returns, None)
+    ones = np.ones(n_components)
 
-    networks.backward(cotangents.sum(1), value_gradients, 0.0)
+    def derivatives() -> None:
+        surrogate_cotangents(log_prob, *arguments)
+        value_cotangents(values, old_values, returns, None)
+
+    networks.backward(cotangents, ones, value_gradients, 0.0)
     model.policy.optimizer.step()
     n_batches = setting.n_samples // setting.batch_size
-    with networks.one_thread():
+    with networks.session():
         return {
             "minibatch from the rollout": microseconds(
                 lambda: list(model.rollout_buffer.get(setting.batch_size))
@@ -73,7 +74,7 @@ def pieces(setting: Setting, n_components: int) -> dict[str, float]:
             "signals and Gramian": microseconds(lambda: networks.gramian(cotangents)),
             "resolver": microseconds(lambda: RESOLVERS["gcr"](gramian, levels, rng)),
             "backward pass": microseconds(
-                lambda: networks.backward(cotangents.sum(1), value_gradients, 0.0)
+                lambda: networks.backward(cotangents, ones, value_gradients, 0.0)
             ),
             "norm and clip": microseconds(lambda: networks.clip_gradients(0.5)),
             "Adam": microseconds(model.policy.optimizer.step),

@@ -33,7 +33,7 @@ class LossByLoss(GCRPPO):
         self.actor = [
             weight for name, weight in self.policy.named_parameters() if "value" not in name
         ]
-        advantages = self.rollout_buffer.advantages.reshape(-1, self.n_objectives)
+        advantages = self.rollout_buffer.advantages.reshape(-1, self.n_components)
         scale = advantages.sum(1).std(ddof=1) + 1e-8
         normalized = (advantages - advantages.mean(0)) / scale
         self.rollout_buffer.advantages = normalized.reshape(self.rollout_buffer.advantages.shape)
@@ -53,7 +53,7 @@ class LossByLoss(GCRPPO):
         self.policy.optimizer.zero_grad()
         self.backward_actor(losses)
         assert entropy is not None
-        value_loss = self.n_objectives * F.mse_loss(values, batch.returns)
+        value_loss = self.n_components * F.mse_loss(values, batch.returns)
         (self.vf_coef * value_loss - self.ent_coef * entropy.mean()).backward()  # type: ignore[no-untyped-call]
         th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         self.policy.optimizer.step()

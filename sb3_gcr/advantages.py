@@ -5,7 +5,7 @@ Pure functions on arrays. The last axis is always the reward component, K of the
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ def component_gae(
     gamma: float,
     gae_lambda: float,
 ) -> FloatArray:
-    r"""Generalised advantage estimation, once per component (METHOD: component GAE;
+    r"""Generalised advantage estimation, once per component (
     arXiv:1506.02438).
 
     .. math::
@@ -71,48 +71,44 @@ def component_gae(
     return advantages
 
 
-def joint_scale(advantages: ArrayT, eps: float = 1e-8, kappa_max: float = np.inf) -> Any:
-    r"""One scale for all components: the summed advantage gets unit variance, ratios between
-    components are kept.
+class Normalised(NamedTuple):
+    """Jointly normalised advantages, and by how much they were scaled."""
 
-    .. math:: κ = 1 / \max(σ(\textstyle\sum_k A^{(k)}) + ε,\ \max_k σ(A^{(k)}) / κ_{max})
+    advantages: Any
+    """Â, of the type and shape of A."""
+    kappa: Any
+    """κ, one number."""
+
+
+def normalize_jointly(
+    advantages: ArrayT, eps: float = 1e-8, kappa_max: float = np.inf
+) -> Normalised:
+    r"""Joint normalisation: one scale κ for all components, so that the summed advantage has unit
+    variance and the ratios between components are kept.
+
+    .. math::
+        Â = κ (A - \bar A), \qquad
+        κ = 1 / \max(σ(\textstyle\sum_k A^{(k)}) + ε,\ \max_k σ(A^{(k)}) / κ_{max})
 
     The second term bounds κ where components cancel and the variance of their sum vanishes. σ has
-    ddof 1, as in PPO.
+    ddof 1, as in PPO; the mean is taken per component over all samples.
 
-    :param advantages: NumPy array or torch tensor of shape (samples, K)
-    :param eps: added to the standard deviation
+    :param advantages: A, NumPy array or tensor of shape (..., K)
+    :param eps: ε, added to the standard deviation
     :param kappa_max: bound of κ · max_k σ(A^(k)), without unit
-    :return: κ; 1 for a single sample, whose standard deviation is undefined
-    """
-    n_samples = len(advantages)
-    if n_samples < 2:
-        return 1.0
-    total = advantages.sum(-1)
-    scale = _std(total, n_samples) + eps
-    if np.isfinite(kappa_max):
-        scale = scale.clip(min=_std(advantages, n_samples).max() / kappa_max)
-    return 1.0 / scale
-
-
-def normalize_jointly(advantages: ArrayT, eps: float = 1e-8, kappa_max: float = np.inf) -> ArrayT:
-    """Joint normalisation Â = κ (A - mean), with the κ of :func:`joint_scale` (METHOD: joint
-    normalisation).
-
-    :param advantages: NumPy array or torch tensor of shape (..., K); the mean is taken per
-        component over all samples
-    :param eps: see :func:`joint_scale`
-    :param kappa_max: see :func:`joint_scale`
-    :return: same type and shape; a single sample is returned as it is, as in PPO
+    :return: Â and κ; a single sample, whose deviation is undefined, as it is with κ = 1, as in PPO
     """
     samples = advantages.reshape(-1, advantages.shape[-1])
-    if len(samples) < 2:
-        return advantages
-    return joint_scale(samples, eps, kappa_max) * (advantages - samples.mean(0))
+    n_samples = len(samples)
+    if n_samples < 2:
+        return Normalised(advantages, 1.0)
+    scale = _std(samples.sum(-1), n_samples) + eps
+    if np.isfinite(kappa_max):
+        scale = scale.clip(min=_std(samples, n_samples).max() / kappa_max)
+    kappa = 1.0 / scale
+    return Normalised(kappa * (advantages - samples.mean(0)), kappa)
 
 
 def _std(samples: Any, n_samples: int) -> Any:
-    """Standard deviation over the first axis with ddof 1, spelled so that NumPy arrays and torch
-    tensors both take it.
-    """
+    """Standard deviation over the first axis with ddof 1, of NumPy arrays and of tensors."""
     return (((samples - samples.mean(0)) ** 2).sum(0) / (n_samples - 1)) ** 0.5

@@ -23,14 +23,14 @@ class VectorRolloutBuffer(RolloutBuffer):
     N, K).
 
     :param args: the arguments of SB3's ``RolloutBuffer``
-    :param n_objectives: number K of reward components
+    :param n_components: number K of reward components
     :param kwargs: the keyword arguments of SB3's ``RolloutBuffer``
     """
 
     _samples_class: type[Any] = RolloutBufferSamples
 
-    def __init__(self, *args: Any, n_objectives: int = 1, **kwargs: Any):
-        self.n_objectives = n_objectives
+    def __init__(self, *args: Any, n_components: int = 1, **kwargs: Any):
+        self.n_components = n_components
         super().__init__(*args, **kwargs)
 
     def reset(self) -> None:
@@ -42,7 +42,7 @@ class VectorRolloutBuffer(RolloutBuffer):
             setattr(
                 self,
                 name,
-                np.zeros((self.buffer_size, self.n_envs, self.n_objectives), dtype=np.float32),
+                np.zeros((self.buffer_size, self.n_envs, self.n_components), dtype=np.float32),
             )
 
     def add(  # type: ignore[override]

@@ -4,7 +4,7 @@ gradients.
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
@@ -13,25 +13,24 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Figure, TensorBoardOutputFormat
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import explained_variance, update_learning_rate
+from stable_baselines3.common.utils import update_learning_rate
 
-from sb3_gcr.advantages import joint_scale, normalize_jointly
-from sb3_gcr.gradients.by_autograd import ManyBackwards
-from sb3_gcr.gradients.by_hand import OneBackward
-from sb3_gcr.logs.figures import (
-    EpochStatistics,
+from sb3_gcr.checks import check_choice, check_number
+from sb3_gcr.gradients import METHODS, ActorCritic, choose
+from sb3_gcr.gradients.by_hand import ByHand
+from sb3_gcr.gradients.memory import Array, Weights
+from sb3_gcr.logs.figures import Record, Samples, by_key, join, mean_cosines, of_rollout
+from sb3_gcr.logs.shown import CosineTable, log_cosines
+from sb3_gcr.losses import Clip, kl_estimates, surrogate_cotangents, value_cotangents
+from sb3_gcr.minibatches import (
+    SCOPES,
     Minibatch,
-    Samples,
-    join,
-    mean_cosines,
-    measure_epoch,
-    summarise,
+    Normalisation,
+    minibatches,
+    refuse_infinite_rollout,
 )
-from sb3_gcr.logs.shown import append_cosines, cosine_figure
-from sb3_gcr.losses import kl_estimates, surrogate_cotangents, value_cotangents
 from sb3_gcr.resolvers import Resolver, bind_resolver
 from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS, RewardDecomposition
 from sb3_gcr.saving.model import PersistentPPO
@@ -41,6 +40,14 @@ SelfGCRPPO = TypeVar("SelfGCRPPO", bound="GCRPPO")
 
 #: Every how many updates the cosine matrix goes to TensorBoard as a picture.
 FIGURE_INTERVAL = 10
+
+
+class Update(NamedTuple):
+    """What the minibatches of one update share; it ends with the update."""
+
+    actor_critic: ActorCritic
+    clip: Clip
+    record: Record
 
 
 class GCRPPO(PersistentPPO):
@@ -154,38 +161,16 @@ class GCRPPO(PersistentPPO):
         self._resolver_rng = loaded_rng or self._resolver_rng or np.random.default_rng()
 
     def _check_parameters(self) -> None:
-        if self.advantage_scope not in (None, "rollout", "minibatch"):
-            raise ValueError(
-                "Parameter `advantage_scope` must be 'rollout', 'minibatch' or None, found "
-                f"{self.advantage_scope!r}."
-            )
-        if not self.kappa_max > 0:
-            raise ValueError(
-                f"Parameter `kappa_max` must be a number > 0, found {self.kappa_max!r}."
-            )
-        if self.gramian_method not in ("auto", "one_backward", "passes"):
-            raise ValueError(
-                "Parameter `gramian_method` must be 'auto', 'one_backward' or 'passes', found "
-                f"{self.gramian_method!r}."
-            )
-        samples = self.gramian_samples
-        if samples is not None and not (isinstance(samples, int | np.integer) and samples > 0):
-            raise ValueError(
-                "Parameter `gramian_samples` must be an integer > 0 or None, found "
-                f"{self.gramian_samples!r}."
-            )
-        if self.desired_kl is not None and not self.desired_kl > 0:
-            raise ValueError(
-                f"Parameter `desired_kl` must be a number > 0 or None, found {self.desired_kl!r}."
-            )
+        check_choice("advantage_scope", self.advantage_scope, SCOPES, optional=True)
+        check_choice("gramian_method", self.gramian_method, METHODS)
+        check_number("kappa_max", self.kappa_max, 0, above=True)
+        check_number("gramian_samples", self.gramian_samples, 1, integer=True, optional=True)
+        check_number("desired_kl", self.desired_kl, 0, above=True, optional=True)
 
     @property
-    def _is_plain_ppo(self) -> bool:
-        return (
-            super()._is_plain_ppo
-            and self.desired_kl is None
-            and self.advantage_scope in (None, "minibatch")
-        )
+    def _is_scalar_ppo(self) -> bool:
+        like_ppo = self.desired_kl is None and self.advantage_scope in (None, "minibatch")
+        return super()._is_scalar_ppo and like_ppo
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed all generators of SB3, and the one that the resolver draws from.
@@ -197,215 +182,146 @@ class GCRPPO(PersistentPPO):
             self._resolver_rng = np.random.default_rng(seed)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_resolve", "_networks"]
+        return [*super()._excluded_save_params(), "_resolve"]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if not self._is_plain_ppo:  # a wrong resolver fails before the first rollout
-            self._weigh(np.eye(self.n_objectives), np.random.default_rng(0))
+        if not self._is_scalar_ppo:  # a wrong resolver fails before the first rollout
+            self._weigh(np.eye(self.n_components), np.random.default_rng(0))
         result = super()._setup_learn(*args, **kwargs)
-        if not self._is_plain_ppo:
-            networks = self._choose_networks()
-            way = "one backward pass" if isinstance(networks, OneBackward) else "K backward passes"
-            library = (
-                "NumPy" if isinstance(networks, OneBackward) and networks.in_numpy else "PyTorch"
-            )
-            self.logger.info(f"Gradients of the components: {way} in {library}")
+        if not self._is_scalar_ppo:
+            CosineTable.of(self.logger, self.reward_spec)
+            way = choose(self.policy, self.gramian_method, self.batch_size).way
+            self.logger.info(f"Gradients of the components: {way}")
         return result
 
     @th.no_grad()
-    @np.errstate(
-        over="ignore", invalid="ignore"
-    )  # what is not finite is refused with an error of its own
+    @np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused by name
     def train(self) -> None:
         """Update the policy from the current rollout: the paper's method, minibatch by minibatch.
 
         :raises ValueError: if a gradient is not finite, before it reaches the weights
         """
-        self._check_rollout_is_finite()
-        if self._is_plain_ppo:
+        refuse_infinite_rollout(self.rollout_buffer, self.num_timesteps)
+        if self._is_scalar_ppo:
             with th.enable_grad():
                 super().train()
             return
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
-        clip_range_vf = None
-        if self.clip_range_vf is not None:
-            clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
-        self._networks = self._choose_networks()
-        kappa = self._normalize_rollout()
-        epochs: list[EpochStatistics] = []
-        continue_training = True
-        with self._networks.one_thread():
-            while continue_training and len(epochs) < self.n_epochs:
-                minibatches: list[Minibatch] = []
-                for batch in self.rollout_buffer.get(self.batch_size):
-                    is_first = not (epochs or minibatches)
-                    minibatch, continue_training = self._train_minibatch(
-                        batch, kappa, clip_range, clip_range_vf, is_first
-                    )
-                    minibatches.append(minibatch)
-                    if not continue_training:
-                        break
-                epochs.append(measure_epoch(minibatches, clip_range, clip_range_vf))
-        self._n_updates += len(epochs)
+        clip = self._clip()
+        # Anew for each update: a callback may have frozen or replaced layers.
+        actor_critic = choose(self.policy, self.gramian_method, self.batch_size)
+        update = Update(actor_critic, clip, Record(clip))
+        normalisation = Normalisation(self._scope, self.kappa_max).of_rollout(self.rollout_buffer)
+        with actor_critic.session():
+            for _ in range(self.n_epochs):
+                goes_on = self._train_epoch(update, normalisation)
+                update.record.end_epoch()
+                if not goes_on:
+                    break
+        self._n_updates += len(update.record.epochs)
         self._n_rollouts_learned += 1
-        self._log_update(epochs, clip_range, clip_range_vf)
+        self._log_update(update)
 
-    def _choose_networks(self) -> OneBackward | ManyBackwards:
-        """The cheapest way through the policy that gives the exact Gramian."""
-        fits = OneBackward.fits(self.policy)
-        if self.gramian_method == "one_backward" and not fits:
-            raise ValueError(
-                "Parameter `gramian_method` must be 'auto' or 'passes' for this policy, found "
-                "'one_backward', which needs an "
-                "actor and a critic of linear layers and common activations, a flat features "
-                "extractor and no gSDE."
-            )
-        self.logger.record("gcr/one_backward", int(fits and self.gramian_method != "passes"))
-        if self.gramian_method == "passes" or not fits:
-            return ManyBackwards(self.policy)
-        return OneBackward(self.policy, self.batch_size)
-
-    def _check_rollout_is_finite(self) -> None:
-        """Refuse a rollout with NaN or infinity, which rewards, observations or the networks may
-        have brought in.
-        """
-        for name in ("log_probs", "values", "advantages"):
-            if not np.isfinite(getattr(self.rollout_buffer, name)).all():
-                raise ValueError(
-                    f"The rollout's `{name}` must be finite, found NaN or infinity before the "
-                    "update at timestep "
-                    f"{self.num_timesteps}. The policy is as it was; check rewards and "
-                    "observations, e.g. with VecCheckNan."
-                )
+    def _clip(self) -> Clip:
+        """PPO's clip ranges now."""
+        progress = self._current_progress_remaining
+        clip_range: float = self.clip_range(progress)  # type: ignore[operator]
+        if self.clip_range_vf is None:
+            return Clip(clip_range, None)
+        return Clip(clip_range, self.clip_range_vf(progress))  # type: ignore[operator]
 
     @property
     def _scope(self) -> str | None:
+        """Over what advantages are normalised."""
         if not self.normalize_advantage:
             return None
-        return self.advantage_scope or ("rollout" if self.n_objectives > 1 else "minibatch")
+        return self.advantage_scope or ("rollout" if self.n_components > 1 else "minibatch")
 
-    def _normalize_rollout(self) -> th.Tensor | None:
-        """Normalise the whole rollout's advantages, if that is the scope, and return κ; None if
-        minibatches have theirs.
-        """
-        if self._scope == "minibatch":
-            return None
-        kappa = 1.0
-        if self._scope == "rollout":
-            advantages = self.rollout_buffer.advantages
-            kappa = joint_scale(advantages.reshape(-1, self.n_objectives), kappa_max=self.kappa_max)
-            self.rollout_buffer.advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
-        return th.tensor(kappa, dtype=th.float32, device=self.device)
+    def _train_epoch(self, update: Update, normalisation: Normalisation) -> bool:
+        """One pass over the rollout; False where ``target_kl`` ends the update before its end."""
+        epoch = minibatches(
+            self.rollout_buffer,
+            self.batch_size,
+            normalisation,
+            update.actor_critic,
+            discrete=isinstance(self.action_space, spaces.Discrete),
+        )
+        return all(self._train_minibatch(update, batch) for batch in epoch)
 
-    def _train_minibatch(
-        self,
-        batch: Any,
-        kappa: th.Tensor | None,
-        clip_range: float,
-        clip_range_vf: float | None,
-        is_first: bool,
-    ) -> tuple[Minibatch, bool]:
-        """One optimiser step; returns what is logged of it and whether ``target_kl`` lets training
-        go on.
-        """
-        actions = (
-            batch.actions.long().flatten()
-            if isinstance(self.action_space, spaces.Discrete)
-            else batch.actions
+    def _train_minibatch(self, update: Update, batch: Minibatch) -> bool:
+        """One optimiser step of the paper's method; False where ``target_kl`` ends the update."""
+        actor_critic, clip, record = update
+        values, log_prob = actor_critic.evaluate(batch.observations, batch.actions)  # V, log π
+        cotangents = surrogate_cotangents(  # c (B, K)
+            log_prob, batch.old_log_prob, batch.advantages, clip.policy
         )
-        networks = self._networks.evaluate(batch.observations, actions)
-        tensors = batch.old_log_prob, batch.old_values, batch.returns, batch.advantages
-        old_log_prob, old_values, returns, advantages = (
-            networks.array(tensor) for tensor in tensors
+        gramian, kl = self._to_host(  # G (K, K)
+            actor_critic.gramian(cotangents, self.gramian_samples), log_prob, batch.old_log_prob
         )
-        if kappa is None:
-            kappa = th.as_tensor(
-                joint_scale(advantages, kappa_max=self.kappa_max), device=self.device
-            )
-            advantages = normalize_jointly(advantages, kappa_max=self.kappa_max)
-        cotangents = surrogate_cotangents(networks.log_prob, old_log_prob, advantages, clip_range)
-        needed = [networks.gramian(cotangents, self.gramian_samples).reshape(-1)]
-        if self.target_kl is not None or self.desired_kl is not None:
-            needed.append(kl_estimates(networks.log_prob, old_log_prob).mean().reshape(1))
-        host = join(needed).cpu().numpy().astype(float)
-        n = self.n_objectives
-        gramian = host[: n * n].reshape(n, n)
-        arrays = networks.log_prob, old_log_prob, advantages, networks.values, old_values, returns
-        samples = Samples(*arrays, networks.entropy_loss(), kappa)
-        if not np.isfinite(gramian).all():
-            raise ValueError(
-                self._not_finite_message(
-                    Minibatch(samples, gramian, np.ones(n)), clip_range, clip_range_vf
-                )
-            )
-        assert self._resolver_rng is not None
-        minibatch = Minibatch(samples, gramian, self._weigh(gramian, self._resolver_rng))
-        if self.target_kl is not None and host[-1] > 1.5 * self.target_kl:
-            self.logger.info(f"Early stopping due to reaching max kl: {host[-1]:.2f}")
-            return minibatch, False
-        if (
-            self.desired_kl is not None and not is_first
-        ):  # before the first step the KL divergence is 0 and says nothing
-            self._set_learning_rate(
-                adapt_learning_rate(self._learning_rate, float(host[-1]), self.desired_kl)
-            )
-        weights = networks.array(
-            th.from_numpy(minibatch.weights.astype(np.float32)).to(self.device)
+        weights = self._weigh(gramian, self._resolver_rng)  # w (K,)
+        record.add(
+            _samples(batch, values, log_prob),
+            actor_critic.entropy_loss(),
+            batch.kappa,
+            gramian,
+            weights,
         )
-        value_gradients = value_cotangents(networks.values, old_values, returns, clip_range_vf)
-        value_gradients *= self.vf_coef
-        networks.backward(cotangents @ weights, value_gradients, self.ent_coef)
-        norm = networks.clip_gradients(self.max_grad_norm)
-        if not np.isfinite(norm):
-            raise ValueError(self._not_finite_message(minibatch, clip_range, clip_range_vf, norm))
+        if self._leaves_target(kl):
+            return False
+        self._follow(kl, is_first=len(record) == 1)
+        value_gradients = self.vf_coef * value_cotangents(
+            values, batch.old_values, batch.returns, clip.values
+        )
+        actor_critic.backward(cotangents, weights, value_gradients, self.ent_coef)  # d = Jᵀ w
+        self._refuse_infinite(record, actor_critic.clip_gradients(self.max_grad_norm))
         self.policy.optimizer.step()
-        return minibatch, True
+        return True
 
-    def _weigh(self, gramian: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    def _to_host(
+        self, gramian: Array, log_prob: Array, old_log_prob: Array
+    ) -> tuple[NDArray[np.float64], float | None]:
+        """One transfer from the device: G, and the KL divergence where a rule needs it.
+
+        :raises ValueError: if G is not finite
+        """
+        parts = [gramian.reshape(-1)]
+        needs_kl = self.target_kl is not None or self.desired_kl is not None
+        if needs_kl:
+            parts.append(kl_estimates(log_prob, old_log_prob).mean().reshape(1))
+        host = join(parts).cpu().numpy().astype(float)
+        gramian = host[: self.n_components**2].reshape(self.n_components, self.n_components)
+        if not np.isfinite(gramian).all():
+            raise ValueError(self._not_finite_message("gradient Gramian", gramian))
+        return gramian, float(host[-1]) if needs_kl else None
+
+    def _weigh(self, gramian: NDArray[np.float64], rng: np.random.Generator | None) -> Weights:
         """Call the resolver and check what it returns."""
-        weights = np.asarray(
-            self._resolve(gramian, np.array(self.reward_spec.levels), rng), dtype=float
-        )
-        if weights.shape != (self.n_objectives,):
+        assert rng is not None
+        levels = np.array(self.reward_spec.levels)
+        weights = np.asarray(self._resolve(gramian, levels, rng), dtype=float)
+        if weights.shape != (self.n_components,):
             raise ValueError(
-                f"Parameter `resolver` must return weights of shape ({self.n_objectives},), found "
-                f"shape {weights.shape}."
+                "Parameter `resolver` must return weights of shape "
+                f"({self.n_components},), found shape {weights.shape}."
             )
         if not np.isfinite(weights).all():
             raise ValueError(f"Parameter `resolver` must return finite weights, found {weights}.")
         return weights
 
-    def _not_finite_message(
-        self,
-        minibatch: Minibatch,
-        clip_range: float,
-        clip_range_vf: float | None,
-        norm: float = np.inf,
-    ) -> str:
-        figures = measure_epoch([minibatch], clip_range, clip_range_vf)
-        by_name = {
-            "gradient Gramian": figures.gramians,
-            "policy loss": figures.policy_losses,
-            "value loss": figures.value_losses,
-            "gradient norm": np.array(norm),
-        }
-        name, found = next(
-            (name, found) for name, found in by_name.items() if not np.isfinite(found).all()
-        )
-        return (
-            f"The {name} must be finite, found {found[~np.isfinite(found)][0]} in the update at "
-            "timestep "
-            f"{self.num_timesteps}. The weights are those of the last good step; a smaller "
-            "`learning_rate`, or scaled "
-            "returns (VecNormalize), may help."
-        )
+    def _leaves_target(self, kl: float | None) -> bool:
+        """Whether the policy has moved further than ``target_kl`` allows, as in SB3's PPO."""
+        if self.target_kl is None or kl is None or kl <= 1.5 * self.target_kl:
+            return False
+        self.logger.info(f"Early stopping due to reaching max kl: {kl:.2f}")
+        return True
 
-    @property
-    def _learning_rate(self) -> float:
-        """The rate of the next step."""
-        return float(self.policy.optimizer.param_groups[0]["lr"])
+    def _follow(self, kl: float | None, is_first: bool) -> None:
+        """Let the learning rate follow the KL divergence, which says nothing before a step."""
+        if self.desired_kl is None or kl is None or is_first:
+            return
+        rate = float(self.policy.optimizer.param_groups[0]["lr"])
+        self._set_learning_rate(adapt_learning_rate(rate, kl, self.desired_kl))
 
     def _set_learning_rate(self, learning_rate: float) -> None:
         self._adaptive_learning_rate = learning_rate
@@ -418,62 +334,52 @@ class GCRPPO(PersistentPPO):
         if self.desired_kl is not None and self._adaptive_learning_rate is not None:
             self._set_learning_rate(self._adaptive_learning_rate)
 
-    def _log_update(
-        self, epochs: list[EpochStatistics], clip_range: float, clip_range_vf: float | None
-    ) -> None:
+    def _refuse_infinite(self, record: Record, norm: float) -> None:
+        """Refuse a gradient that is not finite, and say which loss made it so."""
+        if np.isfinite(norm):
+            return
+        record.end_epoch()
+        figures = record.epochs[-1]
+        suspects = {
+            "policy loss": figures.policy_losses[-1],
+            "value loss": figures.value_losses[-1],
+        }
+        for name, found in suspects.items():
+            if not np.isfinite(found).all():
+                raise ValueError(self._not_finite_message(name, found))
+        raise ValueError(self._not_finite_message("gradient norm", np.array([norm])))
+
+    def _not_finite_message(self, name: str, found: NDArray[np.float64]) -> str:
+        return (
+            f"The {name} must be finite, found {found[~np.isfinite(found)][0]} in the update at "
+            f"timestep {self.num_timesteps}. The weights are those of the last good step; a "
+            "smaller `learning_rate`, or scaled returns (VecNormalize), may help."
+        )
+
+    def _log_update(self, update: Update) -> None:
         """Record the means over all minibatches of the update under PPO's keys and ours."""
-        scalars, by_component = summarise(epochs, self.reward_spec)
-        values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
-        for index, name in enumerate(self.reward_spec.names):
-            by_component[f"train/explained_variance/{name}"] = explained_variance(
-                values[..., index].flatten(), returns[..., index].flatten()
-            )
-        last = epochs[-1]
-        policy_loss, value_loss = (
-            last.weights[-1] @ last.policy_losses[-1],
-            last.value_losses[-1].sum(),
-        )
-        scalars["train/loss"] = (
-            policy_loss + self.ent_coef * last.entropy_losses[-1] + self.vf_coef * value_loss
-        )
-        scalars["train/explained_variance"] = explained_variance(
-            values.sum(-1).flatten(), returns.sum(-1).flatten()
-        )
+        scalars, components = by_key(update.record, self.reward_spec)
+        buffer_scalars, buffer_components = of_rollout(self.rollout_buffer, self.reward_spec)
+        scalars |= buffer_scalars
+        components |= buffer_components
+        scalars["train/loss"] = update.record.last_loss(self.ent_coef, self.vf_coef)
         if hasattr(self.policy, "log_std"):
             scalars["train/std"] = th.exp(self.policy.log_std).mean().item()
-        scalars["train/clip_range"] = clip_range
-        if clip_range_vf is not None:
-            scalars["train/clip_range_vf"] = clip_range_vf
+        scalars["train/clip_range"] = update.clip.policy
+        if update.clip.values is not None:
+            scalars["train/clip_range_vf"] = update.clip.values
         if self.desired_kl is not None:
-            scalars["train/learning_rate"] = self._learning_rate
+            scalars["train/learning_rate"] = self.policy.optimizer.param_groups[0]["lr"]
+        scalars["gcr/one_backward"] = float(isinstance(update.actor_critic, ByHand))
         for key, value in scalars.items():
             self.logger.record(key, value)
-        for (
-            key,
-            value,
-        ) in (
-            by_component.items()
-        ):  # SB3's table raises when two keys are cut to the same 36 characters
+        for key, value in components.items():  # SB3's table raises when two cut keys are the same
             self.logger.record(key, value, exclude="stdout")
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self._log_cosines(mean_cosines(epochs))
-
-    def _log_cosines(self, matrix: NDArray[np.float64]) -> None:
-        """Write the cosine matrix to its file, and every few updates to TensorBoard as a
-        picture.
-        """
-        folder = self.logger.get_dir()
-        if self.n_objectives == 1 or folder is None:
-            return
-        append_cosines(folder, self.reward_spec, self.num_timesteps, matrix)
-        if self._n_rollouts_learned % FIGURE_INTERVAL == 1 and any(
-            isinstance(f, TensorBoardOutputFormat) for f in self.logger.output_formats
-        ):
-            figure = Figure(
-                cosine_figure(self.reward_spec, {f"{self.num_timesteps} steps": matrix}),
-                close=False,
-            )
-            self.logger.record("gcr/cosines", figure, exclude=("stdout", "log", "json", "csv"))
+        if self.n_components > 1:
+            as_picture = self._n_rollouts_learned % FIGURE_INTERVAL == 1
+            matrix = mean_cosines(update.record)
+            log_cosines(self.logger, self.reward_spec, self.num_timesteps, matrix, as_picture)
 
     def learn(
         self: SelfGCRPPO,
@@ -497,3 +403,15 @@ class GCRPPO(PersistentPPO):
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )
+
+
+def _samples(batch: Minibatch, values: Array, log_prob: Array) -> Samples:
+    """What the record keeps of a minibatch."""
+    return Samples(
+        log_prob=log_prob,
+        old_log_prob=batch.old_log_prob,
+        advantages=batch.advantages,
+        values=values,
+        old_values=batch.old_values,
+        returns=batch.returns,
+    )

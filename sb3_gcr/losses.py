@@ -7,12 +7,21 @@ backward pass with the cotangent c w.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 
 from sb3_gcr.advantages import ArrayT
+
+
+class Clip(NamedTuple):
+    """PPO's clip ranges at a moment of training."""
+
+    policy: float
+    """ε, of the ratio ρ."""
+    values: float | None
+    """Of a value head's change, in units of the return; None does not clip."""
 
 
 def surrogate_losses(

@@ -53,20 +53,20 @@ class VectorPPO(PPO):
         super().__init__(*args, **kwargs)
 
     @property
-    def n_objectives(self) -> int:
+    def n_components(self) -> int:
         """Number K of reward components."""
         return len(self.reward_spec)
 
     @property
-    def _is_plain_ppo(self) -> bool:
+    def _is_scalar_ppo(self) -> bool:
         """Whether SB3's own rollouts and update run."""
-        return self.n_objectives == 1
+        return self.n_components == 1
 
     def _setup_model(self) -> None:
         if any(base.__module__.startswith("sb3_contrib") for base in self.policy_class.__mro__):
             raise ValueError(_wrong_policy_message(self.policy_class.__name__))
         self._adopt_reward_spec()
-        if self._is_plain_ppo:
+        if self._is_scalar_ppo:
             super()._setup_model()
             return
         given = {
@@ -99,10 +99,10 @@ class VectorPPO(PPO):
     def _choose_vector_classes(self) -> None:
         """Let SB3's setup build a policy and a buffer with K heads."""
         if not issubclass(self.policy_class, MultiHeadActorCriticPolicy):
-            if self.n_objectives > 1:
+            if self.n_components > 1:
                 raise ValueError(_wrong_policy_message(self.policy_class.__name__))
         else:
-            self.policy_kwargs = {**self.policy_kwargs, "n_objectives": self.n_objectives}
+            self.policy_kwargs = {**self.policy_kwargs, "n_components": self.n_components}
         if self.rollout_buffer_class is None:
             is_dict = isinstance(self.observation_space, spaces.Dict)
             self.rollout_buffer_class = VectorDictRolloutBuffer if is_dict else VectorRolloutBuffer
@@ -114,7 +114,7 @@ class VectorPPO(PPO):
             )
         self.rollout_buffer_kwargs = {
             **self.rollout_buffer_kwargs,
-            "n_objectives": self.n_objectives,
+            "n_components": self.n_components,
         }
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
@@ -150,24 +150,24 @@ class VectorPPO(PPO):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         assert self.env is not None
-        if self.n_objectives > 1 and find_reward_spec(self.env) is None:
+        if self.n_components > 1 and find_reward_spec(self.env) is None:
             raise ValueError(
-                f"The env reports no reward components, but the model has {self.n_objectives}: "
+                f"The env reports no reward components, but the model has {self.n_components}: "
                 f"{self.reward_spec}. "
                 "Wrap it with `RewardDecomposition`, or set another with `set_env`; `predict` "
                 "works without."
             )
         resets = reset_num_timesteps or self._last_obs is None
         if resets or self._episode_components is None:
-            self._episode_components = np.zeros((self.env.num_envs, self.n_objectives))
+            self._episode_components = np.zeros((self.env.num_envs, self.n_components))
         if reset_num_timesteps:
             self.ep_component_buffer = deque(maxlen=self._stats_window_size)
         result = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         self._reader = ComponentReader(self.env, self.reward_spec)
-        if self.n_objectives > 1:
-            self.logger.info(f"{self.n_objectives} reward components: {self.reward_spec}")
+        if self.n_components > 1:
+            self.logger.info(f"{self.n_components} reward components: {self.reward_spec}")
         else:
             self.logger.info("One reward component: training is SB3's PPO with one objective.")
         return result
@@ -190,7 +190,7 @@ class VectorPPO(PPO):
         :raises ValueError: if the components of a step are missing, not finite, or do not sum to
             the reward
         """
-        if self._is_plain_ppo:
+        if self._is_scalar_ppo:
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
         assert self._last_obs is not None, "No previous observation was provided"
         self.policy.set_training_mode(False)
@@ -245,7 +245,7 @@ class VectorPPO(PPO):
     def _read_components(
         self, rewards: NDArray[Any], infos: Any
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        if self.n_objectives == 1:  # a VecEnv may then return no infos at all
+        if self.n_components == 1:  # a VecEnv may then return no infos at all
             return rewards[:, None], rewards[:, None]
         return self._reader.read(rewards, infos, self.num_timesteps)
 
@@ -292,7 +292,7 @@ class VectorPPO(PPO):
         n_diverged = getattr(self.env, "n_diverged", None)  # our batched envs count them
         if n_diverged is not None:
             self.logger.record("rollout/n_diverged", n_diverged)
-        if self.n_objectives == 1:
+        if self.n_components == 1:
             super().dump_logs(iteration)
             return
         if self.ep_component_buffer:

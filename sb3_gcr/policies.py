@@ -20,18 +20,18 @@ class MultiHeadActorCriticPolicy(ActorCriticPolicy):
     """SB3's ``ActorCriticPolicy`` with V_φ(s) ∈ R^K: ``predict_values``, ``forward`` and
     ``evaluate_actions`` return (B, K).
 
-    With ``n_objectives=1`` it is SB3's policy, weight for weight.
+    With ``n_components=1`` it is SB3's policy, weight for weight.
 
     :param args: the arguments of SB3's policy
-    :param n_objectives: number K of value heads; ``GCRPPO`` sets it, it does not belong in
+    :param n_components: number K of value heads; ``GCRPPO`` sets it, it does not belong in
         ``policy_kwargs``
     :param kwargs: the keyword arguments of SB3's policy
     """
 
-    def __init__(self, *args: Any, n_objectives: int = 1, **kwargs: Any):
-        self.n_objectives = n_objectives
+    def __init__(self, *args: Any, n_components: int = 1, **kwargs: Any):
+        self.n_components = n_components
         self._fuse_optimizer = (
-            n_objectives > 1
+            n_components > 1
             and kwargs.get("optimizer_class") is None
             and kwargs.get("optimizer_kwargs") is None
         )
@@ -39,9 +39,9 @@ class MultiHeadActorCriticPolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        if self.n_objectives == 1:
+        if self.n_components == 1:
             return
-        self.value_net = nn.Linear(self.mlp_extractor.latent_dim_vf, self.n_objectives)
+        self.value_net = nn.Linear(self.mlp_extractor.latent_dim_vf, self.n_components)
         if self.ortho_init:
             self.value_net.apply(partial(self.init_weights, gain=1))
         # The fused Adam takes the same steps up to rounding; only where the user chose no optimiser
@@ -57,7 +57,7 @@ class MultiHeadActorCriticPolicy(ActorCriticPolicy):
         # architecture.
         return {
             **data,
-            "n_objectives": self.n_objectives,
+            "n_components": self.n_components,
             "share_features_extractor": self.share_features_extractor,
         }
 

@@ -35,7 +35,7 @@ from sb3_gcr import GCRPPO, RewardDecomposition
 env = RewardDecomposition(gym.make("HalfCheetah-v5"))
 model = GCRPPO("MlpPolicy", env, n_steps=250, batch_size=125, n_epochs=2, device="cpu").learn(1000)
 model.save("model")
-assert GCRPPO.load("model", env=env, device="cpu").n_objectives == 2
+assert GCRPPO.load("model", env=env, device="cpu").n_components == 2
 assert (files("sb3_gcr.hyperparams") / "gcrppo.yml").is_file()
 assert (files("sb3_gcr") / "py.typed").is_file()
 if importlib.util.find_spec("mujoco.batch"):

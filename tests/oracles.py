@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_gcr.resolvers import visiting_order
+from sb3_gcr.angles import visiting_order
 
 
 def pcgrad_with_levels(jacobian: Any, levels: Any, rng: np.random.Generator) -> Any:

@@ -10,7 +10,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from sb3_gcr.advantages import bootstrap_truncations, component_gae, joint_scale, normalize_jointly
+from sb3_gcr.advantages import bootstrap_truncations, component_gae, normalize_jointly
 
 
 def test_gae_by_hand() -> None:
@@ -88,24 +88,27 @@ def test_joint_normalisation_by_hand(backend: Any) -> None:
     advantages = backend(np.array([[1.0, 1.0], [3.0, 1.0], [5.0, 7.0]]))
     # sums 2, 4, 12: mean 6, variance (16 + 4 + 36) / 2 = 28
     expected = np.array([[-2.0, -2.0], [0.0, -2.0], [2.0, 4.0]]) / np.sqrt(28)
-    np.testing.assert_allclose(as_numpy(normalize_jointly(advantages)), expected, rtol=1e-6)
-    assert float(joint_scale(advantages)) == pytest.approx(1 / np.sqrt(28))
-    assert type(normalize_jointly(advantages)) is type(advantages)
+    np.testing.assert_allclose(
+        as_numpy(normalize_jointly(advantages).advantages), expected, rtol=1e-6
+    )
+    assert float(normalize_jointly(advantages).kappa) == pytest.approx(1 / np.sqrt(28))
+    assert type(normalize_jointly(advantages).advantages) is type(advantages)
 
 
 @pytest.mark.parametrize("backend", [as_numpy, th.as_tensor], ids=["numpy", "torch"])
 def test_components_that_cancel_are_bounded(backend: Any) -> None:
     half = np.random.default_rng(0).normal(size=200)
     advantages = backend(np.stack([half, -half + 1e-9 * half**2], axis=1))
-    bounded = as_numpy(normalize_jointly(advantages, kappa_max=10.0))
+    bounded = as_numpy(normalize_jointly(advantages, kappa_max=10.0).advantages)
     assert bounded.std(0, ddof=1).max() == pytest.approx(10, rel=1e-6)
-    assert as_numpy(normalize_jointly(advantages)).std(0, ddof=1).max() > 1e6
+    assert as_numpy(normalize_jointly(advantages).advantages).std(0, ddof=1).max() > 1e6
 
 
 def test_bound_does_not_touch_components_that_do_not_cancel() -> None:
     advantages = np.random.default_rng(0).normal(size=(100, 5))
     np.testing.assert_array_equal(
-        normalize_jointly(advantages, kappa_max=10.0), normalize_jointly(advantages)
+        normalize_jointly(advantages, kappa_max=10.0).advantages,
+        normalize_jointly(advantages).advantages,
     )
 
 
@@ -115,13 +118,13 @@ def test_the_sum_is_ppos_normalised_advantage() -> None:
     total = th.as_tensor(advantages.sum(1))
     ppo = (total - total.mean()) / (total.std() + 1e-8)
     np.testing.assert_allclose(
-        normalize_jointly(advantages).sum(1), ppo.numpy(), rtol=1e-9, atol=1e-12
+        normalize_jointly(advantages).advantages.sum(1), ppo.numpy(), rtol=1e-9, atol=1e-12
     )
 
 
 def test_rollout_shape_and_ratios_are_kept() -> None:
     advantages = np.random.default_rng(2).normal(size=(8, 3, 2))
-    result = normalize_jointly(advantages)
+    result = normalize_jointly(advantages).advantages
     assert result.shape == (8, 3, 2)
     centred = advantages - advantages.mean((0, 1))
     np.testing.assert_allclose(result[..., 0] * centred[..., 1], result[..., 1] * centred[..., 0])
@@ -129,6 +132,6 @@ def test_rollout_shape_and_ratios_are_kept() -> None:
 
 def test_one_sample_and_constant_advantages_stay_finite() -> None:
     single = th.tensor([[1.0, 2.0]])
-    assert normalize_jointly(single, kappa_max=10.0).tolist() == [[1.0, 2.0]]
-    assert joint_scale(single) == 1
-    assert np.isfinite(normalize_jointly(np.ones((5, 2)), kappa_max=10.0)).all()
+    assert normalize_jointly(single, kappa_max=10.0).advantages.tolist() == [[1.0, 2.0]]
+    assert normalize_jointly(single).kappa == 1
+    assert np.isfinite(normalize_jointly(np.ones((5, 2)), kappa_max=10.0).advantages).all()

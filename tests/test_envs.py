@@ -177,7 +177,7 @@ def test_wrappers_of_sb3_work_on_top() -> None:
     model = GCRPPO(
         "MlpPolicy", env, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs={"net_arch": [16]}
     ).learn(512)
-    assert model.n_objectives == 7
+    assert model.n_components == 7
     returns = np.mean(model.ep_component_buffer, axis=0)
     assert returns[1] == pytest.approx(
         2 * np.mean([episode["l"] for episode in model.ep_info_buffer]), rel=1e-6

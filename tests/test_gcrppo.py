@@ -129,12 +129,11 @@ def test_all_ways_to_the_gramian_train_alike(kwargs: Any, monkeypatch: pytest.Mo
     models = []
     for method, limit in (("passes", 0), ("one_backward", 2**25), ("one_backward", 0)):
         for name in ("SMALL", "SMALL_FOR_THREADS"):
-            monkeypatch.setattr(f"sb3_gcr.gradients.by_hand.{name}", limit)
+            monkeypatch.setattr(f"sb3_gcr.gradients.memory.{name}", limit)
         model = GCRPPO(
             "MlpPolicy", make_vec_env(Env, 2, seed=0), gramian_method=method, **SMALL, **kwargs
         ).learn(128)
         models.append(model)
-        assert getattr(model._networks, "in_numpy", False) is (limit > 0)
     for model in models[1:]:
         th.testing.assert_close(parameters(models[0]), parameters(model), rtol=1e-3, atol=1e-5)
 
@@ -158,7 +157,7 @@ def test_general_path_with_one_objective_is_ppo_to_rounding() -> None:
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 def test_logged_figures_are_ppos(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Our own loop with one component, uneven minibatches and clipping logs what SB3's PPO logs."""
-    monkeypatch.setattr(GCRPPO, "_is_plain_ppo", False)
+    monkeypatch.setattr(GCRPPO, "_is_scalar_ppo", False)
     settings: dict[str, Any] = {
         "n_steps": 32,
         "batch_size": 24,
@@ -503,8 +502,8 @@ def test_logged_keys(tmp_path: Path) -> None:
             "gcr/grad_norm",
             "gcr/in_conflict",
             "rollout/ep_rew",
-            "train/value_loss",
-            "train/explained_variance",
+            "gcr/value_loss",
+            "gcr/explained_variance",
         )
         for name in names
     }
@@ -516,7 +515,7 @@ def test_logged_keys(tmp_path: Path) -> None:
     assert set(progress.columns) == ours | theirs
     last = progress.iloc[-1]
     assert last["train/value_loss"] == pytest.approx(
-        sum(last[f"train/value_loss/{name}"] for name in names), rel=1e-5
+        sum(last[f"gcr/value_loss/{name}"] for name in names), rel=1e-5
     )
     assert last["rollout/ep_rew_mean"] == pytest.approx(
         sum(last[f"rollout/ep_rew/{name}"] for name in names), rel=1e-4
@@ -676,7 +675,7 @@ def test_adaptive_learning_rate_takes_over_after_the_first_minibatch() -> None:
             (
                 {"gramian_samples": samples},
                 ValueError,
-                f"Parameter `gramian_samples` must be an integer > 0 or None, found {samples}.",
+                f"Parameter `gramian_samples` must be an integer ≥ 1 or None, found {samples}.",
             )
             for samples in (0, 512.0)
         ),
@@ -872,7 +871,7 @@ def test_env_ids_of_the_table_are_taken_apart_and_others_are_not() -> None:
     )
     learned(model, 32)
     assert isinstance(model.rollout_buffer, VectorRolloutBuffer)
-    assert GCRPPO("MlpPolicy", "Pendulum-v1").n_objectives == 1
+    assert GCRPPO("MlpPolicy", "Pendulum-v1").n_components == 1
 
 
 def test_an_undecomposed_env_of_the_table_warns_with_the_line_to_add() -> None:
@@ -884,9 +883,9 @@ def test_an_undecomposed_env_of_the_table_warns_with_the_line_to_add() -> None:
     )
     with pytest.warns(UserWarning, match=exactly(message)):
         model = GCRPPO("MlpPolicy", gym.make("HalfCheetah-v5"))
-    assert model.n_objectives == 1
+    assert model.n_components == 1
     env = make_vec_env("HalfCheetah-v5", wrapper_class=RewardDecomposition)
-    assert GCRPPO("MlpPolicy", env).n_objectives == 2
+    assert GCRPPO("MlpPolicy", env).n_components == 2
 
 
 def test_verbose_says_what_runs(capsys: pytest.CaptureFixture[str]) -> None:

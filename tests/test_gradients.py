@@ -7,15 +7,17 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import scipy.linalg  # noqa: F401 loads its BLAS before the library looks for them
 import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from threadpoolctl import threadpool_info, threadpool_limits
 from torch import nn
 
-from sb3_gcr.gradients import by_hand
-from sb3_gcr.gradients.by_autograd import ManyBackwards, gramian_by_passes
-from sb3_gcr.gradients.by_hand import OneBackward
-from sb3_gcr.gradients.gramian import layer_gramian
+from sb3_gcr.gradients import memory
+from sb3_gcr.gradients.by_autograd import ByAutograd, gramian_by_passes
+from sb3_gcr.gradients.by_hand import ByHand
+from sb3_gcr.gradients.fitting import fits
+from sb3_gcr.gradients.gramian import Layer, component_gramian
 from sb3_gcr.gradients.layers import ACTIVATIONS
 from sb3_gcr.losses import surrogate_cotangents, surrogate_losses, value_cotangents, value_errors
 from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
@@ -135,7 +137,7 @@ def make(
 ) -> Any:
     th.manual_seed(0)
     policy = policy_class(
-        OBSERVATIONS[observation], ACTIONS[action], lambda _: 1e-3, n_objectives=K, **kwargs
+        OBSERVATIONS[observation], ACTIONS[action], lambda _: 1e-3, n_components=K, **kwargs
     )
     with th.no_grad():  # SB3 starts the action head close to zero, where nothing would be tested
         policy.action_net.weight.normal_(0, 0.5)
@@ -186,23 +188,21 @@ def test_one_backward_is_k_backwards(name: str, ent_coef: float, n_samples: int 
     """
     policy, observations = make(**FITTING[name])
     policy.set_training_mode(True)
-    assert OneBackward.fits(policy)
+    assert fits(policy)
     with th.no_grad():
         actions = policy(observations)[0]
     if FITTING[name].get("action") == "Discrete":
         actions = actions.flatten()
     cotangents, value_cotangents = th.randn(B, K), th.randn(B, K)
-    weights = th.rand(K)
+    weights = np.random.default_rng(0).random(K)
     results = []
-    for networks in (
-        ManyBackwards(policy).evaluate(observations, actions),
-        OneBackward(policy, n_samples).evaluate(observations, actions),
-    ):
+    for networks in (ByAutograd(policy), ByHand(policy, n_samples)):
+        values, log_prob = networks.evaluate(observations, actions)
         mine, its = networks.array(cotangents), networks.array(value_cotangents)
         gramian = networks.gramian(mine)
         subset = networks.gramian(mine, n_samples=10)
-        numbers = [networks.values, networks.log_prob, networks.entropy_loss().reshape(())]
-        networks.backward(mine @ networks.array(weights), its, ent_coef)
+        numbers = [values, log_prob, networks.entropy_loss().reshape(())]
+        networks.backward(mine, weights, its, ent_coef)
         norm = networks.clip_gradients(0.5)
         gradients = [parameter.grad.clone() for parameter in policy.parameters()]
         results.append(
@@ -211,7 +211,7 @@ def test_one_backward_is_k_backwards(name: str, ent_coef: float, n_samples: int 
                 for t in (gramian, subset, *numbers, th.tensor(norm), *gradients)
             ]
         )
-    assert getattr(networks, "in_numpy", None) is (n_samples is not None)
+    assert networks.way.endswith("PyTorch" if n_samples is None else "NumPy")
     for expected, actual in zip(*results, strict=True):
         th.testing.assert_close(
             actual, expected, rtol=2e-4, atol=2e-5 * max(1.0, float(expected.abs().max()))
@@ -222,15 +222,15 @@ def test_one_backward_is_k_backwards(name: str, ent_coef: float, n_samples: int 
 def test_small_updates_run_in_numpy_with_one_thread(threads: int, limit: str) -> None:
     policy, _ = make()
     n_parameters = sum(parameter.numel() for parameter in policy.parameters())
-    largest = getattr(by_hand, limit) // n_parameters
+    largest = getattr(memory, limit) // n_parameters
     before = th.get_num_threads()
     th.set_num_threads(threads)
     try:
-        small, large = OneBackward(policy, largest), OneBackward(policy, largest + 1)
+        small, large = ByHand(policy, largest), ByHand(policy, largest + 1)
     finally:
         th.set_num_threads(before)
-    assert small.in_numpy
-    assert not large.in_numpy
+    assert small.way == "one backward pass in NumPy"
+    assert large.way == "one backward pass in PyTorch"
 
     def blas_threads() -> list[int]:
         return [
@@ -239,9 +239,9 @@ def test_small_updates_run_in_numpy_with_one_thread(threads: int, limit: str) ->
 
     with threadpool_limits(2, user_api="blas"):
         assert 2 in blas_threads()
-        with large.one_thread():
+        with large.session():
             assert 2 in blas_threads()
-        with small.one_thread():
+        with small.session():
             assert set(blas_threads()) == {1}
         assert 2 in blas_threads()
 
@@ -250,36 +250,37 @@ def test_small_updates_run_in_numpy_with_one_thread(threads: int, limit: str) ->
 @pytest.mark.filterwarnings("ignore:Implicit dimension choice for softmax")
 def test_everything_else_takes_k_backwards(name: str) -> None:
     policy, observations = make(**OTHERS[name])
-    assert not OneBackward.fits(policy)
+    assert not fits(policy)
     policy.set_training_mode(True)
     with th.no_grad():
         actions = th.zeros(B, 2)
-    networks = ManyBackwards(policy).evaluate(observations, actions)
+    networks = ByAutograd(policy)
+    networks.evaluate(observations, actions)
     gramian = networks.gramian(th.randn(B, K))
     assert (th.linalg.eigvalsh(gramian) > -1e-4 * gramian.diagonal().max()).all()
-    networks.backward(th.randn(B), th.randn(B, K), 0.1)
+    networks.backward(th.randn(B, K), np.ones(K), th.randn(B, K), 0.1)
     assert policy.value_net.weight.grad.abs().sum() > 0
 
 
 def test_frozen_and_double_parameters_do_not_fit() -> None:
     policy, _ = make()
     policy.action_net.weight.requires_grad_(False)
-    assert not OneBackward.fits(policy)
+    assert not fits(policy)
     policy, _ = make()
-    assert not OneBackward.fits(policy.double())
+    assert not fits(policy.double())
     policy, _ = make()
     policy.extra = nn.Parameter(th.zeros(1))
-    assert not OneBackward.fits(policy)
+    assert not fits(policy)
     policy, _ = make()
     policy.mlp_extractor.register_forward_hook(lambda *_: None)
-    assert not OneBackward.fits(policy)
+    assert not fits(policy)
     policy, _ = make()
     policy.action_net.weight.register_hook(lambda gradient: 2 * gradient)
-    assert not OneBackward.fits(policy)
+    assert not fits(policy)
 
 
 @pytest.mark.parametrize(
-    ("n_samples", "n_objectives", "sizes"),
+    ("n_samples", "n_components", "sizes"),
     [
         (40, 3, [(5, 4), (4, 2)]),
         (700, 3, [(90, 80), (80, 2)]),
@@ -292,7 +293,7 @@ def test_frozen_and_double_parameters_do_not_fit() -> None:
 def test_both_forms_of_the_gramian(
     monkeypatch: pytest.MonkeyPatch,
     n_samples: int,
-    n_objectives: int,
+    n_components: int,
     sizes: Any,
     block: int,
     width: int,
@@ -300,12 +301,12 @@ def test_both_forms_of_the_gramian(
     """Small and large minibatches, in one block or many, against the Jacobian written out."""
     monkeypatch.setattr("sb3_gcr.gradients.gramian.BLOCK", block)
     th.manual_seed(0)
-    cotangents = th.randn(n_samples, n_objectives, dtype=th.double)
+    cotangents = th.randn(n_samples, n_components, dtype=th.double)
     signals = [th.randn(n_samples, out, dtype=th.double) for _, out in sizes]
     inputs = [th.randn(n_samples, size, dtype=th.double) for size, _ in sizes]
     added = th.randn(n_samples, width, dtype=th.double)
     rows = []
-    for k in range(n_objectives):
+    for k in range(n_components):
         c = cotangents[:, k]
         parts = [
             th.einsum("b,bo,bi->oi", c, s, h).flatten()
@@ -314,12 +315,8 @@ def test_both_forms_of_the_gramian(
         parts.append(c @ added)
         rows.append(th.cat(parts))
     expected = th.stack(rows) @ th.stack(rows).T
-    th.testing.assert_close(layer_gramian(signals, inputs, added, cotangents), expected)
-    arrays = (
-        [signal.numpy() for signal in signals],
-        [features.numpy() for features in inputs],
-        added.numpy(),
-    )
-    np.testing.assert_allclose(
-        layer_gramian(*arrays, cotangents.numpy()), expected, rtol=1e-7, atol=1e-9
-    )
+    layers = [Layer(*pair) for pair in zip(signals, inputs, strict=True)]
+    th.testing.assert_close(component_gramian(layers, added, cotangents), expected)
+    arrays = [Layer(layer.signals.numpy(), layer.inputs.numpy()) for layer in layers]
+    actual = component_gramian(arrays, added.numpy(), cotangents.numpy())
+    np.testing.assert_allclose(actual, expected, rtol=1e-7, atol=1e-9)

@@ -13,10 +13,10 @@ from examples.reachability import table
 DOCS = (Path(__file__).parents[1] / "docs/tasks.md").read_text()
 
 
-@pytest.mark.parametrize(("task", "n_objectives"), [("HumanoidMO", 4), ("ThrowingMO", 6)])
-def test_every_range_can_be_reached(task: str, n_objectives: int) -> None:
+@pytest.mark.parametrize(("task", "n_components"), [("HumanoidMO", 4), ("ThrowingMO", 6)])
+def test_every_range_can_be_reached(task: str, n_components: int) -> None:
     rows = table(task)
-    assert len(rows) == 5 * n_objectives
+    assert len(rows) == 5 * n_components
     for objective, bounds, paid, _ in rows:
         assert paid > 0, (objective, bounds)
         assert f"| `{objective}` | {bounds} |" in DOCS

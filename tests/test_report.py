@@ -10,7 +10,7 @@ import pytest
 
 from sb3_gcr import RewardSpec
 from sb3_gcr.logs.report import write_report
-from sb3_gcr.logs.shown import append_cosines, component_table
+from sb3_gcr.logs.shown import CosineTable, component_table
 
 SPEC = RewardSpec(("run", "save"), (0, 1))
 
@@ -30,8 +30,9 @@ def test_table_and_pictures(tmp_path: Path) -> None:
     (tmp_path / "progress.csv").write_text(
         "\n".join(",".join(map(str, row)) for row in [columns, *rows]) + "\n"
     )
+    table = CosineTable(str(tmp_path), SPEC)
     for step, cosine in ((200, -0.5), (300, 0.25)):
-        append_cosines(str(tmp_path), SPEC, step, np.array([[1.0, cosine], [cosine, 1.0]]))
+        table.append(step, np.array([[1.0, cosine], [cosine, 1.0]]))
     assert (tmp_path / "cosines.csv").read_text().splitlines() == [
         "time/total_timesteps,run | save",
         "200,-0.5",

@@ -10,15 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_gcr import RESOLVERS
+from sb3_gcr.angles import conflicts, cosines, visiting_order
+from sb3_gcr.fast_gcr import FEW, gcr, no_priority
 from sb3_gcr.resolvers import (
-    FEW,
-    conflicts,
-    cosines,
-    gcr,
     gcr_authors,
     guaranteed,
-    no_priority,
-    visiting_order,
 )
 from tests.oracles import authors_in_place, pcgrad_with_levels, random_jacobian
 

@@ -73,7 +73,7 @@ def test_everything_comes_back(path: Path, kwargs: Any) -> None:
     loaded = GCRPPO.load(path, make_vec_env(Env, 3))
     assert th.equal(parameters(model), parameters(loaded))
     assert loaded.reward_spec == SPEC
-    assert loaded.n_objectives == 3
+    assert loaded.n_components == 3
     for name in (
         "resolver",
         "resolver_kwargs",
@@ -87,7 +87,7 @@ def test_everything_comes_back(path: Path, kwargs: Any) -> None:
     assert loaded._adaptive_learning_rate == model._adaptive_learning_rate
     assert loaded._resolver_rng.bit_generator.state == model._resolver_rng.bit_generator.state
     assert loaded.policy_kwargs == model.policy_kwargs
-    assert "n_objectives" not in loaded.policy_kwargs
+    assert "n_components" not in loaded.policy_kwargs
     assert loaded.rollout_buffer_class is None
     np.testing.assert_array_equal(
         np.array(loaded.ep_component_buffer), np.array(model.ep_component_buffer)
@@ -135,7 +135,7 @@ def test_policies_save_and_load_alone(path: Path) -> None:
         )
         model.policy.save(path)
         loaded = policy_class.load(path)
-        assert loaded.n_objectives == 3
+        assert loaded.n_components == 3
         assert loaded.share_features_extractor is False
         obs = model.policy.obs_to_tensor(env.reset())[0]
         assert th.equal(loaded.predict_values(obs), model.policy.predict_values(obs))

@@ -131,8 +131,8 @@ def test_every_entry_makes_a_model(algo: str, env_id: str, monkeypatch: pytest.M
     assert isinstance(model, PPO)
     assert model.n_steps * model.n_envs % model.batch_size == 0
     if algo == "gcrppo":
-        assert model.n_objectives == (
-            1 if env_id == "InvertedPendulum-v5" else max(2, model.n_objectives)
+        assert model.n_components == (
+            1 if env_id == "InvertedPendulum-v5" else max(2, model.n_components)
         )  # type: ignore[attr-defined]
         assert getattr(model, "desired_kl") == entry.get("desired_kl")  # noqa: B009
     model.env.close()

@@ -27,7 +27,7 @@ class Robot(GCRPPO):
     """A subclass keeps its type through `learn`, `load` and `warm_start`."""
 
     def greet(self) -> str:
-        return f"{self.n_objectives} components: {', '.join(self.reward_spec.names)}"
+        return f"{self.n_components} components: {', '.join(self.reward_spec.names)}"
 
 
 class StopWhenTired(BaseCallback):

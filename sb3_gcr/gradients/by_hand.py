@@ -1,223 +1,138 @@
-"""The actor-critic of linear layers, evaluated and differentiated by hand with one backward
-pass.
+"""The actor-critic of linear layers, evaluated and differentiated by hand: one backward pass for
+all K gradients.
 """
 
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from itertools import accumulate
-from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.distributions import (
-    BernoulliDistribution,
-    CategoricalDistribution,
-    DiagGaussianDistribution,
-    MultiCategoricalDistribution,
-)
+from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, MlpExtractor
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_gcr.gradients.gramian import layer_gramian
-from sb3_gcr.gradients.heads import GaussianHead, LogitsHead
+from sb3_gcr.gradients.fitting import actor_modules, critic_modules
+from sb3_gcr.gradients.gramian import Layer, component_gramian
+from sb3_gcr.gradients.heads import head_of
 from sb3_gcr.gradients.layers import Mlp
-from sb3_gcr.gradients.memory import SMALL, SMALL_FOR_THREADS, Array, Memory, _blas
+from sb3_gcr.gradients.memory import Array, Memory, Weights, is_small
 
 
-class OneBackward:
-    """An actor-critic of linear layers, evaluated and differentiated by hand: what
-    ``ManyBackwards`` does, at PPO's price.
+class ByHand:
+    """What :class:`~sb3_gcr.gradients.by_autograd.ByAutograd` computes, at PPO's price.
 
-    Under ``torch.no_grad`` call :meth:`evaluate` with a minibatch, then :meth:`gramian` and
-    :meth:`backward`.
+    It is an :class:`~sb3_gcr.gradients.ActorCritic`; its arrays are NumPy's for small updates.
 
-    :param policy: must fit, see :meth:`fits`
-    :param n_samples: size of the minibatches to come; small ones on the CPU run in NumPy. None is
-        PyTorch in any case
+    :param policy: one that :func:`~sb3_gcr.gradients.fitting.fits`
+    :param n_samples: size B of the minibatches to come; None is PyTorch in any case
     """
 
-    def __init__(self, policy: Any, n_samples: int | None = None):
+    def __init__(self, policy: ActorCriticPolicy, n_samples: int | None = None):
         self.policy = policy
-        n_parameters = sum(parameter.numel() for parameter in policy.parameters())
-        limit = SMALL if th.get_num_threads() == 1 else SMALL_FOR_THREADS
-        in_numpy = (
-            n_samples is not None
-            and n_samples * n_parameters <= limit
-            and policy.device.type == "cpu"
-        )
-        actor, critic = _actor_modules(policy), _critic_modules(policy)
-        gaussian = isinstance(policy.action_dist, DiagGaussianDistribution)
-        biases: list[list[Any]] = [
-            [layer.bias for layer in modules[::2]] for modules in (actor, critic)
-        ]
-        self._memory = Memory(
-            [*biases[0], *([policy.log_std] if gaussian else []), *biases[1]], policy, in_numpy
-        )
-        self.actor, self.critic = (
-            Mlp(*actor, memory=self._memory),
-            Mlp(*critic, memory=self._memory),
-        )
-        self.head: GaussianHead | LogitsHead
-        self.head = (
-            GaussianHead(policy, self._memory) if gaussian else LogitsHead(policy, self._memory)
-        )
-        self._widths = [bias.numel() for bias in biases[0]]
-        extractor, space = policy.pi_features_extractor, policy.observation_space
+        in_numpy = n_samples is not None and is_small(policy, n_samples)
+        self.way = f"one backward pass in {'NumPy' if in_numpy else 'PyTorch'}"
+        actor, critic = actor_modules(policy), critic_modules(policy)
+        self._memory = Memory(_summed_parameters(policy), policy, in_numpy)
+        self.actor, self.critic = Mlp(actor, self._memory), Mlp(critic, self._memory)
+        self.head = head_of(policy, self._memory)
+        self._widths = [len(bias) for bias in self.actor.biases]
         # Vectors pass through SB3's preprocessing and flattening as they are.
-        self._takes_vectors = (
-            type(extractor) is FlattenExtractor
-            and isinstance(space, spaces.Box)
-            and len(space.shape) == 1
-        )
+        space = policy.observation_space
+        is_vector = isinstance(space, spaces.Box) and len(space.shape) == 1
+        self._takes_vectors = is_vector and type(policy.pi_features_extractor) is FlattenExtractor
 
-    @property
-    def in_numpy(self) -> bool:
-        """Whether arrays are NumPy's."""
-        return self._memory.in_numpy
-
-    @staticmethod
-    def fits(policy: Any) -> bool:
-        """Whether SB3's own forward pass runs in this policy, through linear layers and known
-        activations alone.
-        """
-        overridable = (
-            "evaluate_actions",
-            "extract_features",
-            "_get_action_dist_from_latent",
-            "_build_mlp_extractor",
-        )
-        if any(
-            getattr(type(policy), name, None) is not getattr(ActorCriticPolicy, name)
-            for name in overridable
-        ):
-            return False
-        heads = (
-            DiagGaussianDistribution,
-            CategoricalDistribution,
-            MultiCategoricalDistribution,
-            BernoulliDistribution,
-        )
-        if type(policy.action_dist) not in heads or type(policy.mlp_extractor) is not MlpExtractor:
-            return False
-        if not (Mlp.fits(*_actor_modules(policy)) and Mlp.fits(*_critic_modules(policy))):
-            return False
-        if not all(
-            _only_flattens(e) for e in (policy.pi_features_extractor, policy.vf_features_extractor)
-        ):
-            return False
-        hooks = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-        if any(getattr(module, name) for module in policy.modules() for name in hooks):
-            return False
-        modules = [
-            m
-            for m in (*_actor_modules(policy), *_critic_modules(policy))
-            if isinstance(m, nn.Linear)
-        ]
-        known = {p for m in modules for p in (m.weight, m.bias)} | {
-            getattr(policy, "log_std", None)
-        }
-        plain = (
-            p.requires_grad and p.dtype == th.float32 and not p._backward_hooks
-            for p in policy.parameters()
-        )
-        return all(p in known for p in policy.parameters()) and all(plain)
-
-    def one_thread(self) -> AbstractContextManager[Any]:
-        """Hold NumPy's BLAS, where it is used, to one thread: several would wait for each other
-        longer than they work.
-        """
-        return _blas().limit(limits=1) if self.in_numpy else nullcontext()
+    def session(self) -> AbstractContextManager[object]:
+        """NumPy's BLAS has one thread during an update in NumPy."""
+        return self._memory.one_thread()
 
     def array(self, tensor: th.Tensor) -> Array:
-        """A tensor of the minibatch in the form that the other methods take and return."""
+        """A tensor's numbers, in its own memory."""
         return self._memory.array(tensor)
 
-    def evaluate(self, observations: Any, actions: th.Tensor) -> OneBackward:
-        """Forward pass of actor and critic; sets ``values`` (B, K) and ``log_prob`` (B,)."""
-        if self._takes_vectors:
-            features = observations.float()
-        else:
-            features = BasePolicy.extract_features(
-                self.policy, observations, self.policy.pi_features_extractor
-            )
-        features = self.array(features)
-        self.values = self.critic.forward(features)
-        self.log_prob = self.head.forward(self.actor.forward(features), actions)
-        return self
+    def evaluate(self, observations: PyTorchObs, actions: th.Tensor) -> tuple[Array, Array]:
+        """Values V, shape (B, K), and log π(a|s), shape (B,)."""
+        features = self.array(self._features(observations))
+        values = self.critic.forward(features)
+        return values, self.head.log_prob(self.actor.forward(features), actions)
 
-    def gramian(self, cotangents: Array, n_samples: int | None = None) -> Array:
-        """Gramian of the component gradients, shape (K, K).
-
-        :param cotangents: of log π, shape (B, K)
-        :param n_samples: take the first n rows of the minibatch instead of all; they are in random
-            order already
-        """
-        signals = self.actor.signals(self.head.signal())
-        self._added = self._memory.xp.concatenate(
-            [*signals, *self.head.score()], 1
-        )  # ∂log π/∂bias of all layers, and S
-        inputs, added = self.actor.inputs, self._added
-        if n_samples is not None:
-            signals, inputs = (
-                [array[:n_samples] for array in arrays] for arrays in (signals, inputs)
-            )
-            added, cotangents = added[:n_samples], cotangents[:n_samples]
-        return layer_gramian(signals, inputs, added, cotangents)
+    def _features(self, observations: PyTorchObs) -> th.Tensor:
+        if self._takes_vectors and isinstance(observations, th.Tensor):
+            return observations.float()
+        extractor = self.policy.pi_features_extractor
+        return BasePolicy.extract_features(self.policy, observations, extractor)
 
     def entropy_loss(self) -> Array:
-        """PPO's entropy loss: minus the mean entropy."""
+        """Minus the mean entropy."""
         return self.head.entropy_loss()
 
-    def backward(self, cotangent: Array, value_cotangents: Array, ent_coef: float) -> None:
-        """Set the gradient of the whole loss; call :meth:`gramian` before.
+    def gramian(self, cotangents: Array, n_samples: int | None = None) -> Array:
+        """G = J Jᵀ of the component gradients, shape (K, K).
 
-        :param cotangent: of log π, shape (B,)
-        :param value_cotangents: of the values, shape (B, K)
+        :param cotangents: C, shape (B, K)
+        :param n_samples: take the first n rows instead of all
+        """
+        signals = self.actor.signals(self.head.signal())
+        # ∂log π/∂bias is the layer's signal itself.
+        self._scores = self._memory.xp.concatenate([*signals, *self.head.scores()], 1)
+        rows = slice(n_samples)
+        layers = [
+            Layer(delta[rows], features[rows])
+            for delta, features in zip(signals, self.actor.inputs, strict=True)
+        ]
+        return component_gramian(layers, self._scores[rows], cotangents[rows])
+
+    def backward(
+        self, cotangents: Array, weights: Weights, value_gradients: Array, ent_coef: float
+    ) -> None:
+        """Set the parameters' gradients to those of the whole loss; call :meth:`gramian` before.
+
+        :param cotangents: C, shape (B, K)
+        :param weights: w, shape (K,)
+        :param value_gradients: of the loss by the values, shape (B, K)
         :param ent_coef: weight of the entropy loss
         """
         self._memory.attach()
-        concatenate, column = self._memory.xp.concatenate, cotangent[:, None]
+        concatenate = self._memory.xp.concatenate
+        cotangent = (cotangents @ self._memory.weights(weights))[:, None]
         entropy_signal = self.head.entropy_signal() if ent_coef != 0 else None
         if entropy_signal is None:
-            added = self._added * column
+            scores = self._scores * cotangent
         else:
-            added = concatenate(
-                self.actor.signals(self.head.signal() * column + ent_coef * entropy_signal), 1
-            )
-        critic_signals = self.critic.signals(value_cotangents)
-        ends = list(accumulate(self._widths))
-        self.actor.write_weight_gradients(
-            added[:, end - n : end] for n, end in zip(self._widths, ends, strict=True)
-        )
+            signal = self.head.signal() * cotangent + ent_coef * entropy_signal
+            scores = concatenate(self.actor.signals(signal), 1)
+        critic_signals = self.critic.signals(value_gradients)
+        self.actor.write_weight_gradients(self._by_layer(scores))
         self.critic.write_weight_gradients(critic_signals)
-        self._memory.sums[:] = concatenate([added, *critic_signals], 1).sum(0)
+        self._memory.sums[:] = concatenate([scores, *critic_signals], 1).sum(0)
         if ent_coef != 0:
             self.head.add_entropy_gradient(ent_coef)
 
+    def _by_layer(self, scores: Array) -> list[Array]:
+        """The columns of the actor's layers, each of shape (B, out)."""
+        ends = accumulate(self._widths)
+        columns = zip(self._widths, ends, strict=True)
+        return [scores[:, end - width : end] for width, end in columns]
+
     def clip_gradients(self, max_norm: float) -> float:
-        """Scale all gradients down to a joint norm of at most ``max_norm``, as ``clip_grad_norm_``;
-        the norm before.
-        """
-        flat = self._memory.flat
-        norm = math.sqrt(float(flat @ flat))
+        """Scale all gradients to a joint norm of at most ``max_norm``; return the norm before."""
+        gradients = self._memory.gradients
+        norm = math.sqrt(float(gradients @ gradients))
         if norm > max_norm:
-            flat *= max_norm / (norm + 1e-6)
+            gradients *= max_norm / (norm + 1e-6)  # as th.nn.utils.clip_grad_norm_
         return norm
 
 
-def _actor_modules(policy: Any) -> list[nn.Module]:
-    return [*policy.mlp_extractor.policy_net, policy.action_net]
-
-
-def _critic_modules(policy: Any) -> list[nn.Module]:
-    return [*policy.mlp_extractor.value_net, policy.value_net]
-
-
-def _only_flattens(extractor: nn.Module) -> bool:
-    """Whether a features extractor is one of SB3's that only flatten and concatenate."""
-    if type(extractor) is CombinedExtractor:
-        return all(type(part) is nn.Flatten for part in extractor.extractors.values())
-    return type(extractor) is FlattenExtractor
+def _summed_parameters(policy: ActorCriticPolicy) -> list[nn.Parameter]:
+    """Parameters whose gradients are sums over the samples' scores: biases and log σ, in the order
+    in which :meth:`ByHand.backward` has them.
+    """
+    actor = [layer.bias for layer in actor_modules(policy)[::2]]
+    critic = [layer.bias for layer in critic_modules(policy)[::2]]
+    if isinstance(policy.action_dist, DiagGaussianDistribution):
+        return [*actor, policy.log_std, *critic]  # type: ignore[list-item]
+    return [*actor, *critic]  # type: ignore[list-item]

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3.common.logger import Figure as Picture
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
 from sb3_gcr.rewards.spec import RewardSpec, level_label
 
@@ -31,7 +33,7 @@ def component_table(spec: RewardSpec, values: Mapping[str, Any]) -> str:
         "weight": "gcr/weight",
         "in conflict": "gcr/in_conflict",
         "gradient norm": "gcr/grad_norm",
-        "explained var.": "train/explained_variance",
+        "explained var.": "gcr/explained_variance",
     }
     rows = [["component", "level", *columns]]
     for name, level in spec:
@@ -62,26 +64,94 @@ def format_table(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([rule, lines[0], rule, *lines[1:], rule])
 
 
-def append_cosines(
-    folder: str, spec: RewardSpec, timestep: int, matrix: NDArray[np.float64]
-) -> None:
-    """Add one row, the cosines of all pairs, to the CSV file ``cosines.csv``.
+class CosineTable(KVWriter):
+    """The file ``cosines.csv`` beside the other files of a logger: one row of cosines per update.
 
-    :param folder: where the file is or will be
+    It begins anew with its logger, as ``progress.csv`` does.
+
+    :param folder: of the logger
     :param spec: names the components
-    :param timestep: first column
-    :param matrix: shape (K, K)
     """
-    path = Path(folder) / COSINES_FILE
-    pairs = [(i, j) for i in range(len(spec)) for j in range(i + 1, len(spec))]
-    is_new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file)
-        if is_new:
-            writer.writerow(
-                ["time/total_timesteps", *(f"{spec.names[i]} | {spec.names[j]}" for i, j in pairs)]
+
+    def __init__(self, folder: str, spec: RewardSpec):
+        self.spec = spec
+        n_components = len(spec)
+        self._pairs = np.triu_indices(n_components, 1)
+        names = [f"{spec.names[i]} | {spec.names[j]}" for i, j in zip(*self._pairs, strict=True)]
+        self._path = Path(folder) / COSINES_FILE
+        self._path.unlink(missing_ok=True)
+        self._add(["time/total_timesteps", *names])
+
+    @classmethod
+    def of(cls, logger: Logger, spec: RewardSpec) -> CosineTable | None:
+        """The table of a logger, begun if it has none yet; None for a logger without a folder.
+
+        :param logger: SB3's
+        :param spec: names the components
+        :raises ValueError: for a logger that another model with other components has used
+        """
+        folder = logger.get_dir()
+        if folder is None:
+            return None
+        found = [table for table in logger.output_formats if isinstance(table, cls)]
+        if not found:
+            found = [cls(folder, spec)]
+            logger.output_formats.append(found[0])
+        if found[0].spec.names != spec.names:
+            raise ValueError(
+                f"A logger's '{COSINES_FILE}' must have the components of the model, "
+                f"{list(spec.names)}, found {list(found[0].spec.names)} in '{folder}'. "
+                "Give the model a logger of its own: `model.set_logger(configure(...))`."
             )
-        writer.writerow([timestep, *(f"{matrix[i, j]:.6g}" for i, j in pairs)])
+        return found[0]
+
+    def append(self, timestep: int, matrix: NDArray[np.float64]) -> None:
+        """Add one row, the cosines of all pairs.
+
+        :param timestep: first column
+        :param matrix: shape (K, K)
+        """
+        self._add([timestep, *(f"{cosine:.6g}" for cosine in matrix[self._pairs])])
+
+    def _add(self, row: Sequence[object]) -> None:
+        with self._path.open("a", newline="") as file:
+            csv.writer(file).writerow(row)
+
+    def write(
+        self,
+        key_values: dict[str, Any],
+        key_excluded: dict[str, tuple[str, ...]],
+        step: int = 0,
+    ) -> None:
+        """The logger's single numbers are not for this table."""
+
+    def close(self) -> None:
+        """Nothing is open between two rows."""
+
+
+def log_cosines(
+    logger: Logger,
+    spec: RewardSpec,
+    timestep: int,
+    matrix: NDArray[np.float64],
+    as_picture: bool,
+) -> None:
+    """Write a cosine matrix to its file, and to TensorBoard as a picture.
+
+    :param logger: SB3's
+    :param spec: names the components
+    :param timestep: of the update
+    :param matrix: shape (K, K)
+    :param as_picture: whether to draw it
+    """
+    table = CosineTable.of(logger, spec)
+    if table is None:
+        return
+    table.append(timestep, matrix)
+    formats = logger.output_formats
+    if as_picture and any(isinstance(f, TensorBoardOutputFormat) for f in formats):
+        figure = Picture(cosine_figure(spec, {f"{timestep} steps": matrix}), close=False)
+        logger.record("gcr/cosines", figure, exclude=("stdout", "log", "json", "csv"))
 
 
 def cosine_figure(spec: RewardSpec, matrices: Mapping[str, NDArray[np.float64]]) -> Figure:

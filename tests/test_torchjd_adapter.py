@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_gcr.resolvers import from_torchjd, guaranteed
+from sb3_gcr.resolvers import guaranteed
+from sb3_gcr.torchjd_adapter import from_torchjd
 from tests.test_resolvers import TORCHJD_MATRIX
 
 torchjd = pytest.importorskip("torchjd.aggregation")
