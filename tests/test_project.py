@@ -135,6 +135,23 @@ ARROWS = {
     "simulators.__init__": set(),
     "simulators.envpool": {"rewards.spec"},
     "simulators.envpool_gym": {"rewards.spec", "simulators.envpool"},
+    "study.__init__": set(),
+    "study.paper": {"study.statistics"},
+    "study.statistics.__init__": {
+        "study.statistics.bootstrap",
+        "study.statistics.counts",
+        "study.statistics.intervals",
+        "study.statistics.permutation",
+        "study.statistics.relation",
+        "study.statistics.scores",
+    },
+    "study.statistics.bootstrap": {"study.statistics.checks"},
+    "study.statistics.checks": set(),
+    "study.statistics.counts": {"study.statistics.checks"},
+    "study.statistics.intervals": {"study.statistics.checks"},
+    "study.statistics.permutation": {"study.statistics.checks"},
+    "study.statistics.relation": {"study.statistics.checks"},
+    "study.statistics.scores": {"study.statistics.checks"},
 }
 #: Packages that the pure modules do without.
 FORBIDDEN = {
@@ -146,6 +163,13 @@ FORBIDDEN = {
     "envs.tasks.planar": {"torch", "stable_baselines3"},
     "envs.tasks.throwing": {"torch", "stable_baselines3"},
     "envs.engine": {"torch", "stable_baselines3"},
+    "study.paper": {"torch", "stable_baselines3"},
+    "study.statistics.bootstrap": {"torch", "stable_baselines3"},
+    "study.statistics.counts": {"torch", "stable_baselines3"},
+    "study.statistics.intervals": {"torch", "stable_baselines3"},
+    "study.statistics.permutation": {"torch", "stable_baselines3"},
+    "study.statistics.relation": {"torch", "stable_baselines3"},
+    "study.statistics.scores": {"torch", "stable_baselines3"},
 }
 MODULES = {
     ".".join(path.relative_to(ROOT / "sb3_gcr").with_suffix("").parts): path

@@ -1,0 +1,1 @@
+"""Studies: does resolving conflicts help, when, and on which reward?"""
