@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,7 @@ from mjlab.managers.reward_manager import RewardTermCfg
 from mjlab.managers.termination_manager import TerminationTermCfg
 from mjlab.tasks.registry import load_env_cfg
 
+PAGE = Path(__file__).parents[2] / "docs/simulators.md"
 CARTPOLE = "Mjlab-Cartpole-Balance"
 GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
 LEVELS = {"upright": "task", "centre": "task", "speed": "regulariser", "effort": "regulariser"}
@@ -194,3 +197,17 @@ def test_go1_steps_with_guessed_levels() -> None:
         total += np.abs(env.reward_components).sum(0)
     assert (total > 0).sum() > 5
     env.close()
+
+
+def test_the_script_of_the_docs_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With fewer envs and two updates."""
+    script = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.S | re.M)[0]
+    for old, new in {"num_envs = 64": "num_envs = 16", "1_000_000": "768"}.items():
+        assert old in script
+        script = script.replace(old, new)
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, Any] = {}
+    exec(compile(script, PAGE.name, "exec"), namespace)
+    assert namespace["model"].num_timesteps == 768
+    assert (tmp_path / "go1.zip").exists()
+    namespace["model"].logger.close()
