@@ -9,10 +9,10 @@ SEED ?= 0
 RESOLVER ?= gcr
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test check format pytest bench doc build lower compare clean
+.PHONY: help install train test test-mjlab check format pytest bench doc build lower compare clean
 
 help:  ## list the commands
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
 
 install: $(VENV)/installed  ## make the environment in .venv
 
@@ -63,6 +63,11 @@ lower:  ## all tests with the oldest dependencies that setup.cfg allows
 	@.venv-lower/bin/python -m pip install --quiet --disable-pip-version-check -c .venv-lower/constraints.txt -e '.[plots,tests]'
 	@OMP_NUM_THREADS=1 .venv-lower/bin/python -m pytest -n 2 -W ignore::DeprecationWarning  # old packages with new ones below them
 
+test-mjlab:  ## ManagerVecEnv on mjlab, in an environment of its own, on the CPU (minutes)
+	@$(PYTHON) -m venv .venv-mjlab
+	@.venv-mjlab/bin/python -m pip install --quiet --disable-pip-version-check -c tests/mjlab/constraints.txt mjlab pytest -e .
+	@OMP_NUM_THREADS=1 WARP_CACHE_PATH=$(CURDIR)/.venv-mjlab/kernels .venv-mjlab/bin/python -m pytest tests/mjlab
+
 doc: install  ## the documentation in docs/_build/html; warnings are errors, and its Python blocks run
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	@echo "== site"
@@ -74,4 +79,4 @@ compare: install  ## the table of the README: GCRPPO and PPO, several seeds
 	@$(BIN)/python examples/compare.py
 
 clean:  ## remove the environment and all caches
-	rm -rf $(VENV) .venv-lower build dist docs/_build *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-lower .venv-mjlab build dist docs/_build *.egg-info .mypy_cache .pytest_cache .ruff_cache

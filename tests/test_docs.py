@@ -30,7 +30,7 @@ NEEDS = {
     "deployment": ["onnxscript", "onnxruntime"],
 }
 #: Pages whose blocks other tests run, or that show scripts.
-ELSEWHERE = {"saving", "rl_zoo3"}
+ELSEWHERE = {"saving", "rl_zoo3", "simulators"}
 #: A Python block, and the error or warning that follows it, if it is there to fail.
 BLOCK = re.compile(
     r"^```python\n(.*?)^```\n(?:\n^```text\n(\w+(?:Error|Warning)): (.*?)\n^```)?", re.S | re.M

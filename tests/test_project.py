@@ -134,6 +134,13 @@ ARROWS = {
     "envs.tasks.planar": {"envs.task", "rewards.decomposition", "rewards.spec"},
     "simulators.__init__": set(),
     "simulators.envpool": {"rewards.spec"},
+    "simulators.manager_spaces": set(),
+    "simulators.manager_terms": {"rewards.spec", "simulators.manager_spaces"},
+    "simulators.managers": {
+        "rewards.spec",
+        "simulators.manager_spaces",
+        "simulators.manager_terms",
+    },
     "simulators.envpool_gym": {"rewards.spec", "simulators.envpool"},
     "study.__init__": set(),
     "study.paper": {"study.statistics"},
