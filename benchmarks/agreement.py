@@ -18,7 +18,7 @@ from sb3_gcr.advantages import normalize_jointly
 from sb3_gcr.angles import conflicts
 from sb3_gcr.gradients.by_hand import ByHand
 from sb3_gcr.logs.shown import format_table
-from sb3_gcr.losses import surrogate_cotangents
+from sb3_gcr.losses import Clip, surrogate_cotangents
 
 SIZES = (64, 128, 256, 512, 1024)
 BATCH = 2048
@@ -52,7 +52,9 @@ class Agreement(BaseCallback):
         )
         networks = ByHand(model.policy)
         _, log_prob = networks.evaluate(observations, actions)
-        cotangents = surrogate_cotangents(log_prob, log_probs.flatten(), advantages, 0.2)
+        cotangents = surrogate_cotangents(
+            log_prob, log_probs.flatten(), advantages, Clip(0.2, None)
+        )
         gramian = networks.gramian(cotangents).double().numpy()
         exact = RESOLVERS["gcr"](gramian, levels, np.random.default_rng(0))
         for size in SIZES:

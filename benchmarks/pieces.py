@@ -15,7 +15,7 @@ from benchmarks.updates import LARGE_2048, SMALL, SMALL_256
 from sb3_gcr import GCRPPO, RESOLVERS
 from sb3_gcr.gradients.by_hand import ByHand
 from sb3_gcr.logs.shown import format_table
-from sb3_gcr.losses import surrogate_cotangents, value_cotangents
+from sb3_gcr.losses import Clip, surrogate_cotangents, value_cotangents
 
 SETTINGS = [(SMALL, 4), (SMALL, 20), (SMALL_256, 10), (LARGE_2048, 10)]
 ROUNDS = 7
@@ -46,7 +46,11 @@ def pieces(setting: Setting, n_components: int) -> dict[str, float]:
     networks = ByHand(model.policy, setting.batch_size)
     values, log_prob = networks.evaluate(batch.observations, batch.actions)
     old_values, returns = networks.array(batch.old_values), networks.array(batch.returns)
-    arguments = (networks.array(batch.old_log_prob), networks.array(batch.advantages), 0.2)
+    arguments = (
+        networks.array(batch.old_log_prob),
+        networks.array(batch.advantages),
+        Clip(0.2, None),
+    )
     cotangents = surrogate_cotangents(log_prob, *arguments)
     value_gradients = value_cotangents(values, old_values, returns, None)
     gramian = np.asarray(networks.gramian(cotangents), dtype=float)

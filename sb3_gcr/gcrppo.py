@@ -23,7 +23,7 @@ from sb3_gcr.gradients.by_hand import ByHand
 from sb3_gcr.gradients.memory import Array, Weights
 from sb3_gcr.logs.figures import Record, Samples, by_key, join, mean_cosines, of_rollout
 from sb3_gcr.logs.shown import CosineTable, log_cosines
-from sb3_gcr.losses import Clip, kl_estimates, surrogate_cotangents, value_cotangents
+from sb3_gcr.losses import CLIPPINGS, Clip, kl_estimates, surrogate_cotangents, value_cotangents
 from sb3_gcr.minibatches import (
     SCOPES,
     Minibatch,
@@ -72,6 +72,9 @@ class GCRPPO(PersistentPPO):
         for any network; "auto" takes the first where it fits. Both give the same numbers
     :param gramian_samples: number of samples of each minibatch that the weights are taken from, for
         large networks and batches; the step takes all of them. None is exact
+    :param surrogate_clipping: what decides whether a sample is clipped: "joint", the summed
+        advantage as in PPO, or "component", each component's own as in the paper, which holds the
+        policy back wherever components disagree
     :raises ValueError: for an unknown resolver or scope, a wrong policy class, a spec that does not
         match a loaded model
     """
@@ -111,6 +114,7 @@ class GCRPPO(PersistentPPO):
         desired_kl: float | None = None,
         gramian_method: str = "auto",
         gramian_samples: int | None = None,
+        surrogate_clipping: str = "joint",
     ):
         self.resolver = resolver
         self.resolver_kwargs = resolver_kwargs
@@ -119,6 +123,7 @@ class GCRPPO(PersistentPPO):
         self.desired_kl = desired_kl
         self.gramian_method = gramian_method
         self.gramian_samples = gramian_samples
+        self.surrogate_clipping = surrogate_clipping
         self._resolver_rng: np.random.Generator | None = None
         self._adaptive_learning_rate: float | None = None
         self._n_rollouts_learned = 0
@@ -163,6 +168,7 @@ class GCRPPO(PersistentPPO):
     def _check_parameters(self) -> None:
         check_choice("advantage_scope", self.advantage_scope, SCOPES, optional=True)
         check_choice("gramian_method", self.gramian_method, METHODS)
+        check_choice("surrogate_clipping", self.surrogate_clipping, CLIPPINGS)
         check_number("kappa_max", self.kappa_max, 0, above=True)
         check_number("gramian_samples", self.gramian_samples, 1, integer=True, optional=True)
         check_number("desired_kl", self.desired_kl, 0, above=True, optional=True)
@@ -227,9 +233,10 @@ class GCRPPO(PersistentPPO):
         """PPO's clip ranges now."""
         progress = self._current_progress_remaining
         clip_range: float = self.clip_range(progress)  # type: ignore[operator]
-        if self.clip_range_vf is None:
-            return Clip(clip_range, None)
-        return Clip(clip_range, self.clip_range_vf(progress))  # type: ignore[operator]
+        clip_range_vf: float | None = None
+        if self.clip_range_vf is not None:
+            clip_range_vf = self.clip_range_vf(progress)  # type: ignore[operator]
+        return Clip(clip_range, clip_range_vf, self.surrogate_clipping)
 
     @property
     def _scope(self) -> str | None:
@@ -254,7 +261,7 @@ class GCRPPO(PersistentPPO):
         actor_critic, clip, record = update
         values, log_prob = actor_critic.evaluate(batch.observations, batch.actions)  # V, log π
         cotangents = surrogate_cotangents(  # c (B, K)
-            log_prob, batch.old_log_prob, batch.advantages, clip.policy
+            log_prob, batch.old_log_prob, batch.advantages, clip
         )
         gramian, kl = self._to_host(  # G (K, K)
             actor_critic.gramian(cotangents, self.gramian_samples), log_prob, batch.old_log_prob

@@ -14,57 +14,98 @@ import torch as th
 
 from sb3_gcr.advantages import ArrayT
 
+#: Values of GCRPPO's parameter ``surrogate_clipping``.
+CLIPPINGS = ("joint", "component")
+
 
 class Clip(NamedTuple):
-    """PPO's clip ranges at a moment of training."""
+    """How PPO clips at a moment of training."""
 
     policy: float
     """ε, of the ratio ρ."""
     values: float | None
     """Of a value head's change, in units of the return; None does not clip."""
+    clipping: str = "joint"
+    """What decides whether a sample is clipped, see :func:`is_clipped`."""
+
+
+def is_clipped(ratio: ArrayT, advantages: ArrayT, clip: Clip) -> ArrayT:
+    r"""Where the clipped surrogate is the smaller one, so that its slope is 0.
+
+    .. math:: ρ_b S_b > \mathrm{clip}(ρ_b, 1-ε, 1+ε) S_b
+
+    "joint" is PPO's own decision, one for each sample: S_b = Σ_k Â_b^(k). "component" is the
+    paper's, one for each sample and component: S_b = Â_b^(k). Where components disagree, the
+    latter lets through those whose sign is not that of the sum, and they push ρ back.
+
+    :param ratio: ρ, shape (B, 1)
+    :param advantages: Â, shape (B, K)
+    :param clip: ε and what decides
+    :return: shape (B, 1) for "joint", (B, K) for "component"
+    """
+    deciding = advantages.sum(1)[:, None] if clip.clipping == "joint" else advantages
+    return ratio * deciding > _clipped(ratio, clip.policy) * deciding  # type: ignore[no-any-return]
 
 
 def surrogate_losses(
-    log_prob: ArrayT, old_log_prob: ArrayT, advantages: ArrayT, clip_range: float
+    log_prob: ArrayT, old_log_prob: ArrayT, advantages: ArrayT, clip: Clip
 ) -> ArrayT:
     r"""PPO's clipped surrogate loss of each sample and component, to be minimised; one ratio ρ for
     all components.
 
-    .. math:: L_b^{(k)} = -\min(ρ_b Â_b^{(k)}, \mathrm{clip}(ρ_b, 1-ε, 1+ε) Â_b^{(k)}), \qquad
+    .. math:: L_b^{(k)} = -(u_b ρ_b + (1 - u_b) \mathrm{clip}(ρ_b, 1-ε, 1+ε)) Â_b^{(k)}, \qquad
         L^{(k)} = \frac{1}{B} \sum_b L_b^{(k)}
+
+    with u = 0 where :func:`is_clipped`, else 1. With "joint" clipping Σ_k L^(k) is PPO's loss on
+    Σ_k Â^(k); with "component" L_b^(k) is -min(ρ_b Â_b^(k), clip(ρ_b) Â_b^(k)), the paper's.
 
     :param log_prob: log π(a_b|s_b) of the current policy, shape (B,)
     :param old_log_prob: the same of the policy that collected the data, shape (B,)
     :param advantages: Â, shape (B, K)
-    :param clip_range: ε
+    :param clip: ε and what decides
     :return: losses before the mean over samples, shape (B, K)
     """
     ratio = _exp(log_prob - old_log_prob)[:, None]
     xp: Any = th if isinstance(ratio, th.Tensor) else np
-    return -xp.minimum(ratio * advantages, ratio.clip(1 - clip_range, 1 + clip_range) * advantages)
+    clipped = is_clipped(ratio, advantages, clip)
+    return -xp.where(clipped, _clipped(ratio, clip.policy), ratio) * advantages
 
 
 def surrogate_cotangents(
-    log_prob: ArrayT, old_log_prob: ArrayT, advantages: ArrayT, clip_range: float
+    log_prob: ArrayT, old_log_prob: ArrayT, advantages: ArrayT, clip: Clip
 ) -> ArrayT:
     r"""The derivatives of the mean :func:`surrogate_losses` by log π in closed form: all that an
     update needs of them.
 
-    .. math::
-        c_b^{(k)} = \frac{∂L^{(k)}}{∂\log π_b}
-        = -\frac{ρ_b Â_b^{(k)}}{B} \text{ where not clipped, else } 0
+    .. math:: c_b^{(k)} = \frac{∂L^{(k)}}{∂\log π_b} = -\frac{u_b ρ_b Â_b^{(k)}}{B}
+
+    :param log_prob: log π(a_b|s_b), shape (B,)
+    :param old_log_prob: shape (B,)
+    :param advantages: Â, shape (B, K)
+    :param clip: ε and what decides
+    :return: cotangents c, shape (B, K)
+    """
+    ratio = _exp(log_prob - old_log_prob)[:, None]
+    cotangents = ratio * advantages
+    clipped = is_clipped(ratio, advantages, clip)
+    cotangents[clipped[:, 0] if clip.clipping == "joint" else clipped] = 0.0
+    cotangents *= -1 / len(advantages)
+    return cotangents
+
+
+def brakes(log_prob: ArrayT, old_log_prob: ArrayT, advantages: ArrayT, clip_range: float) -> ArrayT:
+    """Which samples PPO clips while clipping by component still lets a gradient through, which then
+    points against the summed advantage, back to the old policy; shape (B,).
 
     :param log_prob: log π(a_b|s_b), shape (B,)
     :param old_log_prob: shape (B,)
     :param advantages: Â, shape (B, K)
     :param clip_range: ε
-    :return: cotangents c, shape (B, K)
     """
     ratio = _exp(log_prob - old_log_prob)[:, None]
-    cotangents = ratio * advantages
-    cotangents[cotangents > ratio.clip(1 - clip_range, 1 + clip_range) * advantages] = 0.0
-    cotangents *= -1 / len(advantages)
-    return cotangents
+    jointly = is_clipped(ratio, advantages, Clip(clip_range, None, "joint"))[:, 0]
+    by_component = is_clipped(ratio, advantages, Clip(clip_range, None, "component"))
+    return jointly & (~by_component & (advantages != 0)).any(1)
 
 
 def kl_estimates(log_prob: ArrayT, old_log_prob: ArrayT) -> ArrayT:
@@ -119,6 +160,10 @@ def value_cotangents(
         errors[abs(values - old_values) > clip_range_vf] = 0.0
     errors *= 2 / len(values)
     return errors
+
+
+def _clipped(ratio: ArrayT, clip_range: float) -> ArrayT:
+    return ratio.clip(1 - clip_range, 1 + clip_range)  # type: ignore[no-any-return]
 
 
 def _exp(array: ArrayT) -> Any:

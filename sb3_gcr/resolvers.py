@@ -60,6 +60,25 @@ def no_priority(gramian: Gramian, levels: Levels, rng: np.random.Generator) -> W
     return gcr(gramian, np.zeros_like(levels), rng)
 
 
+def by_levels(gramian: Gramian, levels: Levels, rng: np.random.Generator) -> Weights:
+    """Priority between levels alone: each level is one sum T_l = Σ_{k in l} g^(k), projected off
+    the sums of the higher levels where they conflict.
+
+    T_l' ← T_l' - min(0, ⟨T_l', T_h⟩) / |T_h|² · T_h for h = l-1 … 0, with the original T_h. Weights
+    are the same inside a level, so the reward's own weights decide there. With two levels no
+    regulariser weakens the sum of the tasks, however many there are:
+    Σ_tasks (G w) ≥ 1ᵀ G 1 over the tasks.
+
+    :param gramian: G, shape (K, K)
+    :param levels: priority level of each component, 0 the highest, shape (K,)
+    :param rng: ignored, the result is deterministic
+    :return: weights w ≥ 1, shape (K,)
+    """
+    ranks, level_of = np.unique(levels, return_inverse=True)
+    members = np.eye(len(ranks))[:, level_of]  # (levels, K)
+    return fast_gcr.gcr(members @ gramian @ members.T, ranks, rng)[level_of]
+
+
 def gcr_authors(gramian: Gramian, levels: Levels, rng: np.random.Generator) -> Weights:
     """The authors' released rule: in place, tasks against tasks and every other component against
     tasks only.
@@ -104,6 +123,7 @@ RESOLVERS: dict[str, Resolver] = {
     "gcr_authors": gcr_authors,
     "no_priority": fast_gcr.no_priority,
     "sum": plain_sum,
+    "levels": by_levels,
     "guaranteed": guaranteed,
 }
 

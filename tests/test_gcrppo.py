@@ -638,14 +638,14 @@ def test_adaptive_learning_rate_takes_over_after_the_first_minibatch() -> None:
             {"resolver": "pcgrad"},
             ValueError,
             "Parameter `resolver` must be one of ['gcr', 'gcr_authors', 'guaranteed', "
-            "'no_priority', 'sum'] or a callable "
+            "'levels', 'no_priority', 'sum'] or a callable "
             "(gramian, levels, rng) -> weights, found 'pcgrad'.",
         ),
         (
             {"resolver": 3},
             TypeError,
             "Parameter `resolver` must be one of ['gcr', 'gcr_authors', 'guaranteed', "
-            "'no_priority', 'sum'] or a callable "
+            "'levels', 'no_priority', 'sum'] or a callable "
             "(gramian, levels, rng) -> weights, found 3.",
         ),
         (

@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import explained_variance
 
 from sb3_gcr.angles import conflicts, cosines
 from sb3_gcr.gradients.memory import Array, Weights
-from sb3_gcr.losses import Clip, kl_estimates, leaves_range, surrogate_losses, value_errors
+from sb3_gcr.losses import Clip, brakes, kl_estimates, leaves_range, surrogate_losses, value_errors
 from sb3_gcr.rewards.spec import RewardSpec
 
 Numbers = NDArray[np.float64]
@@ -38,8 +38,9 @@ class Samples(NamedTuple):
 #: Figures of each sample, of shape (B, K) or (B,); logged are their means over a minibatch.
 SAMPLE_FIGURES: dict[str, Callable[[Samples, Clip], Array]] = {
     "policy_losses": lambda s, clip: surrogate_losses(
-        s.log_prob, s.old_log_prob, s.advantages, clip.policy
+        s.log_prob, s.old_log_prob, s.advantages, clip
     ),
+    "brakes": lambda s, clip: brakes(s.log_prob, s.old_log_prob, s.advantages, clip.policy),
     "value_losses": lambda s, clip: (
         value_errors(s.values, s.old_values, s.returns, clip.values) ** 2
     ),
@@ -57,6 +58,7 @@ class Figures(NamedTuple):
     entropy_losses: Numbers  # (M,)
     policy_losses: Numbers  # L^(k), (M, K)
     value_losses: Numbers  # (M, K)
+    brakes: Numbers  # (M,)
     clip_fractions: Numbers  # (M,)
     kl: Numbers  # (M,)
 
@@ -70,6 +72,7 @@ UPDATE_FIGURES: dict[str, Callable[[Figures], float]] = {
     "gcr/conflicts": lambda f: n_conflicts(f.gramians).mean(),
     "gcr/conflict_rate": lambda f: n_conflicts(f.gramians).mean() / n_pairs(f.gramians),
     "gcr/kappa": lambda f: f.kappas.mean(),
+    "gcr/brake": lambda f: f.brakes.mean(),
 }
 #: Figures of an update by the beginning of their logger keys, one number for each component.
 COMPONENT_FIGURES: dict[str, Callable[[Figures], Numbers]] = {
@@ -146,6 +149,7 @@ class Record:
                 entropy_losses=own[:, 0],
                 policy_losses=by_name["policy_losses"],
                 value_losses=by_name["value_losses"],
+                brakes=by_name["brakes"][:, 0],
                 clip_fractions=by_name["clip_fractions"][:, 0],
                 kl=by_name["kl"][:, 0],
             )
