@@ -26,7 +26,7 @@ from sb3_gcr.rewards.reading import ComponentReader, find_reward_spec, match_spe
 from sb3_gcr.rewards.spec import SCALAR_REWARD, RewardSpec
 
 
-class VectorPPO(PPO):
+class MultiHeadPPO(PPO):
     """SB3's PPO with a critic head and a return per reward component; the update is left to a
     subclass.
 
@@ -306,7 +306,7 @@ class VectorPPO(PPO):
 
 def _wrong_policy_message(name: str) -> str:
     return (
-        f"Parameter `policy` must be one of {sorted(VectorPPO.policy_aliases)} or a subclass of "
+        f"Parameter `policy` must be one of {sorted(MultiHeadPPO.policy_aliases)} or a subclass of "
         "MultiHeadActorCriticPolicy, "
         f"found {name!r}. Recurrent and maskable policies are not supported."
     )

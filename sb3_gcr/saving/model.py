@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_gcr.multi_head_ppo import VectorPPO
+from sb3_gcr.multi_head_ppo import MultiHeadPPO
 from sb3_gcr.saving.archive import (
     ModelPath,
     SavedModel,
@@ -30,8 +30,8 @@ from sb3_gcr.saving.warm_start import merge_parameters
 Self = TypeVar("Self", bound="PersistentPPO")
 
 
-class PersistentPPO(VectorPPO):
-    """``VectorPPO`` with files that are whole, a way to load them without running what they bring,
+class PersistentPPO(MultiHeadPPO):
+    """``MultiHeadPPO`` with files that are whole, a way to load them without running what they bring,
     and warm starts.
 
     :param args: the arguments of SB3's PPO
