@@ -42,6 +42,9 @@ class MultiHeadPPO(PPO):
         "MultiInputPolicy": MultiInputPolicy,
     }
 
+    #: Attributes that are in no file; see ``saving.model``.
+    unsaved: ClassVar[tuple[str, ...]] = ("_reader",)
+
     #: Names and levels of the reward components.
     reward_spec: RewardSpec
 
@@ -137,9 +140,6 @@ class MultiHeadPPO(PPO):
         spec = match_specs(self.reward_spec, find_reward_spec(env))
         super().set_env(env, force_reset)
         self.reward_spec = spec
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_reader"]
 
     def _setup_learn(
         self,
