@@ -286,11 +286,15 @@ class Saving(OnPolicyAlgorithm):
         return model
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """SB3's ``set_env``; a fresh VecNormalize gets the statistics of a model that was loaded
+        """SB3's ``set_env``; the reward components must be those of the model, their order may
+        differ.
+
+        A VecNormalize that has not seen anything yet gets the statistics of a model that was loaded
         without one.
 
         :param env: the environment to learn from
         :param force_reset: reset it before training
+        :raises ValueError: if the names of the components differ
         """
         super().set_env(env, force_reset)
         if self._waiting_statistics is not None:
