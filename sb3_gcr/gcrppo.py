@@ -31,9 +31,10 @@ from sb3_gcr.minibatches import (
     minibatches,
     refuse_infinite_rollout,
 )
+from sb3_gcr.multi_head_ppo import MultiHeadPPO
 from sb3_gcr.resolvers import Resolver, bind_resolver
 from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS, RewardDecomposition
-from sb3_gcr.saving.model import PersistentPPO
+from sb3_gcr.saving.model import Saving
 from sb3_gcr.schedules import adapt_learning_rate
 
 SelfGCRPPO = TypeVar("SelfGCRPPO", bound="GCRPPO")
@@ -50,7 +51,7 @@ class Update(NamedTuple):
     record: Record
 
 
-class GCRPPO(PersistentPPO):
+class GCRPPO(Saving, MultiHeadPPO):
     """PPO with gradient conflict resolution (GCR-PPO, arXiv:2509.14816): a critic head, advantage
     and gradient per component.
 
@@ -78,6 +79,10 @@ class GCRPPO(PersistentPPO):
     :raises ValueError: for an unknown resolver or scope, a wrong policy class, a spec that does not
         match a loaded model
     """
+
+    saved_numbers = ("_n_rollouts_learned", "_adaptive_learning_rate")
+    unsaved = ("_resolve",)
+    followers = (("_adaptive_learning_rate", "learning_rate"), ("_resolver_rng", "seed"))
 
     def __init__(
         self,
@@ -187,8 +192,9 @@ class GCRPPO(PersistentPPO):
         if seed is not None:
             self._resolver_rng = np.random.default_rng(seed)
 
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_resolve"]
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
+        self._adaptive_learning_rate = None  # it has followed the schedule before
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if not self._is_scalar_ppo:  # a wrong resolver fails before the first rollout
@@ -314,6 +320,8 @@ class GCRPPO(PersistentPPO):
             )
         if not np.isfinite(weights).all():
             raise ValueError(f"Parameter `resolver` must return finite weights, found {weights}.")
+        if not all(self._has_paid):
+            return np.where(self.has_paid, weights, 1.0)
         return weights
 
     def _leaves_target(self, kl: float | None) -> bool:

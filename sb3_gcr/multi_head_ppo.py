@@ -26,7 +26,7 @@ from sb3_gcr.rewards.reading import ComponentReader, find_reward_spec, match_spe
 from sb3_gcr.rewards.spec import SCALAR_REWARD, RewardSpec
 
 
-class VectorPPO(PPO):
+class MultiHeadPPO(PPO):
     """SB3's PPO with a critic head and a return per reward component; the update is left to a
     subclass.
 
@@ -42,6 +42,11 @@ class VectorPPO(PPO):
         "MultiInputPolicy": MultiInputPolicy,
     }
 
+    #: Attributes that are in no file; see ``saving.model``.
+    unsaved: ClassVar[tuple[str, ...]] = ("_reader",)
+    #: See :class:`~sb3_gcr.saving.model.Saving`.
+    saved_numbers: ClassVar[tuple[str, ...]] = ("_has_paid",)
+
     #: Names and levels of the reward components.
     reward_spec: RewardSpec
 
@@ -50,6 +55,8 @@ class VectorPPO(PPO):
             maxlen=kwargs.get("stats_window_size", 100)
         )
         self._episode_components: NDArray[np.float64] | None = None
+        #: Which components have ever paid, 1 or 0 each, in the order of ``reward_spec``.
+        self._has_paid: list[int] = []
         super().__init__(*args, **kwargs)
 
     @property
@@ -138,9 +145,6 @@ class VectorPPO(PPO):
         super().set_env(env, force_reset)
         self.reward_spec = spec
 
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_reader"]
-
     def _setup_learn(
         self,
         total_timesteps: int,
@@ -198,6 +202,7 @@ class VectorPPO(PPO):
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
         callback.on_rollout_start()
+        has_paid = self.has_paid
         n_steps = 0
         while n_steps < n_rollout_steps:
             if self.use_sde and self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0:
@@ -211,6 +216,7 @@ class VectorPPO(PPO):
             self.num_timesteps += env.num_envs
             reward_components, original_components = self._read_components(rewards, infos)
             self._count_components(original_components, dones)
+            has_paid |= (original_components != 0).any(0)
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
@@ -230,9 +236,22 @@ class VectorPPO(PPO):
         with th.no_grad():
             values = self.policy.predict_values(obs_as_tensor(new_obs, self.device))  # type: ignore[arg-type]
         rollout_buffer.compute_returns_and_advantage(last_values=values, dones=dones)
+        self._has_paid = has_paid.astype(int).tolist()
+        # The untrained head of a component that has never paid says nothing of an action.
+        rollout_buffer.advantages[..., ~self.has_paid] = 0.0
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
+
+    @property
+    def has_paid(self) -> NDArray[np.bool_]:
+        """Which components have paid in any rollout so far, shape (K,); one alone counts as such.
+
+        A component that has not has no advantage, no gradient and weight 1.
+        """
+        if self.n_components == 1:
+            return np.ones(1, dtype=bool)
+        return np.array(self._has_paid or np.zeros(self.n_components), dtype=bool)
 
     def _to_env_actions(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Bring the policy's actions into the bounds of the action space."""
@@ -306,7 +325,7 @@ class VectorPPO(PPO):
 
 def _wrong_policy_message(name: str) -> str:
     return (
-        f"Parameter `policy` must be one of {sorted(VectorPPO.policy_aliases)} or a subclass of "
+        f"Parameter `policy` must be one of {sorted(MultiHeadPPO.policy_aliases)} or a subclass of "
         "MultiHeadActorCriticPolicy, "
         f"found {name!r}. Recurrent and maskable policies are not supported."
     )

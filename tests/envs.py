@@ -163,3 +163,19 @@ class BatchedEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         return [False] * self.num_envs
+
+
+class Late(Env):
+    """A third component, ``late``, pays nothing until so many steps have been made in all."""
+
+    def __init__(self, first_payment: float = np.inf):
+        super().__init__(RewardSpec(("go", "save", "late"), (0, 1, 0)))
+        self.first_payment, self.n_steps = first_payment, 0
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, _, terminated, truncated, info = super().step(action)
+        self.n_steps += 1
+        components = info["reward_components"]
+        if self.n_steps < self.first_payment:
+            components[2] = 0.0
+        return observation, float(components.sum()), terminated, truncated, info

@@ -35,7 +35,7 @@ from sb3_gcr import (
     evaluate_components,
 )
 from sb3_gcr.schedules import adapt_learning_rate
-from tests.envs import SPEC, BatchedEnv, Env, Terms
+from tests.envs import SPEC, BatchedEnv, Env, Late, Terms
 
 SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 16, "n_epochs": 2, "seed": 0, "device": "cpu"}
 
@@ -353,6 +353,38 @@ def test_seed_decides_everything() -> None:
     assert not th.equal(train(1), train(2))
 
 
+@pytest.mark.parametrize("method", ["one_backward", "passes"])
+@pytest.mark.parametrize("scope", ["rollout", "minibatch"])
+@pytest.mark.parametrize("resolver", ["gcr", "guaranteed", "levels", "gcr_authors"])
+def test_a_term_that_never_pays_is_harmless(method: str, scope: str, resolver: str) -> None:
+    """It has no advantage, no gradient and weight 1, until it pays; a file remembers."""
+    env = make_vec_env(Late, 2, seed=0)
+    kwargs: dict[str, Any] = {"gramian_method": method, "advantage_scope": scope}
+    model = GCRPPO("MlpPolicy", env, resolver=resolver, **kwargs, **SMALL).learn(256)
+    logged = model.logger.name_to_value
+    assert logged["gcr/weight/late"] == 1
+    assert logged["gcr/grad_norm/late"] == 0
+    assert logged["gcr/in_conflict/late"] == 0
+    assert not model.rollout_buffer.advantages[..., 2].any()
+    assert model.rollout_buffer.advantages[..., :2].any()
+
+
+def test_a_term_joins_when_it_first_pays_and_stays(tmp_path: Path) -> None:
+    env = make_vec_env(lambda: Late(33), 1, seed=0)
+    model = GCRPPO("MlpPolicy", env, **SMALL).learn(32)
+    assert model.has_paid.tolist() == [True, True, False]
+    model.learn(32, reset_num_timesteps=False)
+    assert model.has_paid.tolist() == [True, True, True]
+    assert model.rollout_buffer.advantages[..., 2].all()
+    model.save(tmp_path / "model")
+    silent = make_vec_env(Late, 1, seed=0)
+    for weights_only in (False, True):
+        loaded = GCRPPO.load(tmp_path / "model", env=silent, weights_only=weights_only)
+        assert loaded.has_paid.tolist() == [True, True, True]
+    loaded.learn(32, reset_num_timesteps=False)
+    assert loaded.rollout_buffer.advantages[..., 2].any()
+
+
 # ------------------------------------------------------------ rollout contents
 
 
@@ -495,7 +527,7 @@ def test_logged_keys(tmp_path: Path) -> None:
     model.logger.close()
     progress = pd.read_csv(tmp_path / "progress.csv")
     names = SPEC.names
-    ours = {"gcr/conflicts", "gcr/conflict_rate", "gcr/kappa", "gcr/one_backward"} | {
+    ours = {"gcr/conflicts", "gcr/conflict_rate", "gcr/kappa", "gcr/brake", "gcr/one_backward"} | {
         f"{key}/{name}"
         for key in (
             "gcr/weight",

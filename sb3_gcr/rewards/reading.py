@@ -82,7 +82,8 @@ def match_specs(saved: RewardSpec, found: RewardSpec | None) -> RewardSpec:
         raise ValueError(
             "The env's reward components must be those of the model: the model has "
             f"{list(saved.names)}, "
-            f"found {list(found.names)} in the env."
+            f"found {list(found.names)} in the env. `GCRPPO.warm_start(path, env)` begins a new "
+            "model with what a saved one has learned of other components."
         )
     levels = found.to_dict()
     matched = RewardSpec(saved.names, tuple(levels[name] for name in saved.names))

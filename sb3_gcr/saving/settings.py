@@ -1,16 +1,16 @@
-"""A model's settings and spaces as plain JSON: what can be read back without unpickling
+"""A model's settings: which there are, and as plain JSON that can be read without unpickling
 anything.
 """
 
 from __future__ import annotations
 
-import reprlib
-from collections.abc import Mapping
-from typing import Any
+import inspect
+from collections.abc import Callable, Container, Iterable, Mapping
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
@@ -24,56 +24,18 @@ from torch import nn
 
 from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
-#: The arguments of ``GCRPPO`` that are settings.
-SETTINGS = (
-    *(
-        "learning_rate",
-        "n_steps",
-        "batch_size",
-        "n_epochs",
-        "gamma",
-        "gae_lambda",
-        "clip_range",
-        "clip_range_vf",
-    ),
-    *(
-        "normalize_advantage",
-        "ent_coef",
-        "vf_coef",
-        "max_grad_norm",
-        "use_sde",
-        "sde_sample_freq",
-        "rollout_buffer_class",
-    ),
-    *(
-        "rollout_buffer_kwargs",
-        "target_kl",
-        "stats_window_size",
-        "tensorboard_log",
-        "policy_kwargs",
-        "verbose",
-        "seed",
-    ),
-    *(
-        "resolver",
-        "resolver_kwargs",
-        "advantage_scope",
-        "kappa_max",
-        "desired_kl",
-        "gramian_method",
-        "gramian_samples",
-    ),
-)
+#: Arguments of a model's constructor that are no settings.
+NOT_SETTINGS = ("self", "policy", "env", "device", "_init_setup_model")
 #: Those that a file of somebody else has no say in: where to write, and a class.
 PRIVATE = ("tensorboard_log", "rollout_buffer_class")
 #: SB3's policies and ours, by the name that ``GCRPPO(policy)`` takes.
 POLICIES: dict[type[Any], str] = {
-    **{MlpPolicy: "MlpPolicy", CnnPolicy: "CnnPolicy", MultiInputPolicy: "MultiInputPolicy"},
-    **{
-        ActorCriticPolicy: "MlpPolicy",
-        ActorCriticCnnPolicy: "CnnPolicy",
-        MultiInputActorCriticPolicy: "MultiInputPolicy",
-    },
+    MlpPolicy: "MlpPolicy",
+    CnnPolicy: "CnnPolicy",
+    MultiInputPolicy: "MultiInputPolicy",
+    ActorCriticPolicy: "MlpPolicy",
+    ActorCriticCnnPolicy: "CnnPolicy",
+    MultiInputActorCriticPolicy: "MultiInputPolicy",
 }
 #: The classes that ``policy_kwargs`` may name.
 _ACTIVATIONS = (
@@ -100,16 +62,57 @@ CLASSES: dict[str, dict[str, type[Any]]] = {
 }
 
 
-def collect_settings(attributes: Mapping[str, Any]) -> dict[str, Any]:
+def find_settings(model_class: type[Any]) -> dict[str, Any]:
+    """The arguments of a class's constructor that are settings, with their types.
+
+    A constructor that passes ``**kwargs`` on takes those of the class that it inherits from, too.
+
+    :param model_class: GCRPPO or a subclass
+    """
+    found: dict[str, Any] = {}
+    for base in model_class.__mro__:
+        constructor = vars(base).get("__init__")
+        if constructor is None:
+            continue
+        parameters = _find_parameters(constructor)
+        for parameter in parameters:
+            is_named = parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+            if is_named and parameter.name not in NOT_SETTINGS:
+                found.setdefault(parameter.name, parameter.annotation)
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return found
+
+
+def _find_parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:
+    """A constructor's parameters, with types as objects where their names exist at run time."""
+    try:
+        signature = inspect.signature(constructor, eval_str=True)
+    except (NameError, AttributeError, TypeError):
+        signature = inspect.signature(constructor)
+    return list(signature.parameters.values())
+
+
+def attribute_of(setting: str, attributes: Container[str]) -> str:
+    """Where a model keeps a setting: SB3's ``stats_window_size`` is ``_stats_window_size``.
+
+    :param setting: name of the argument
+    :param attributes: names of the model's attributes
+    """
+    private = f"_{setting}"
+    return private if setting not in attributes and private in attributes else setting
+
+
+def collect_settings(attributes: Mapping[str, Any], settings: Iterable[str]) -> dict[str, Any]:
     """The settings among the attributes of a PPO or GCRPPO, as its constructor takes them.
 
     :param attributes: of a model, or of the file of one
+    :param settings: names of ``find_settings``; those that the model does not keep are left out
     """
-    found = {name: attributes[key] for name in SETTINGS if (key := _attribute(name)) in attributes}
-    if found.get("rollout_buffer_class") in (
-        RolloutBuffer,
-        DictRolloutBuffer,
-    ):  # SB3's choice for one objective
+    kept = {name: attribute_of(name, attributes) for name in settings}
+    found = {name: attributes[key] for name, key in kept.items() if key in attributes}
+    # SB3's choice for one objective
+    if found.get("rollout_buffer_class") in (RolloutBuffer, DictRolloutBuffer):
         found["rollout_buffer_class"] = None
     for name in ("learning_rate", "clip_range", "clip_range_vf"):
         if isinstance(found.get(name), FloatSchedule):
@@ -119,8 +122,32 @@ def collect_settings(attributes: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _attribute(name: str) -> str:
-    return "_stats_window_size" if name == "stats_window_size" else name
+def refuse_text(given: Mapping[str, Any], settings: Mapping[str, Any], where: str = "") -> None:
+    """Refuse text and lists where a setting is a number or a switch.
+
+    :param given: values by name
+    :param settings: types of ``find_settings``
+    :param where: where the values come from, for the error
+    :raises ValueError: names the setting, what it must be and what was found
+    """
+    for name, value in given.items():
+        wanted = _number_or_switch(settings.get(name, Any))
+        if wanted is None or not isinstance(value, str | list | tuple | Mapping):
+            continue
+        found = f"the text {value!r}" if isinstance(value, str) else repr(value)
+        hint = " YAML takes 1e-3 for text, and 0.001 or 1.0e-3 for a number." if not where else ""
+        raise ValueError(f"Parameter `{name}` must be {wanted}, found {found}{where}.{hint}")
+
+
+def _number_or_switch(kind: Any) -> str | None:
+    """What an argument of a type must be, None where it is neither number nor switch."""
+    is_union = get_origin(kind) in (Union, UnionType)
+    kinds = get_args(kind) if is_union else (kind,)
+    if str in kinds:
+        return None
+    if bool in kinds:
+        return "True or False"
+    return "a number" if int in kinds or float in kinds else None
 
 
 def describe_settings(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -182,15 +209,21 @@ def to_plain(value: Any) -> Any:
     raise TypeError
 
 
-def parse_settings(plain: Mapping[str, Any]) -> dict[str, Any]:
+def parse_settings(plain: Mapping[str, Any], model_class: type[Any]) -> dict[str, Any]:
     """The inverse of ``describe_settings``.
 
     :param plain: settings as JSON
-    :raises ValueError: for names that are no settings, and classes that are not in ``CLASSES``
+    :param model_class: whose settings they are
+    :raises ValueError: for names that are no settings, text for numbers, and classes that are not
+        in ``CLASSES``
     """
-    unknown = sorted(set(plain) - set(SETTINGS).difference(PRIVATE))
+    known = find_settings(model_class)
+    unknown = sorted(set(plain) - set(known).difference(PRIVATE))
     if unknown:
-        raise ValueError(f"The settings in a file must be arguments of GCRPPO, found {unknown}.")
+        raise ValueError(
+            f"The settings in a file must be arguments of {model_class.__name__}, found {unknown}."
+        )
+    refuse_text(plain, known, " in the file")
     settings = dict(plain)
     if isinstance(settings.get("policy_kwargs"), Mapping):
         settings["policy_kwargs"] = dict(settings["policy_kwargs"])
@@ -203,63 +236,3 @@ def parse_settings(plain: Mapping[str, Any]) -> dict[str, Any]:
                 )
             settings["policy_kwargs"][key] = CLASSES[key][name]
     return settings
-
-
-def describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
-    """An observation or action space as JSON.
-
-    :param space: one that SB3 knows; of others only what they print
-    """
-    kind = type(space).__name__
-    if isinstance(space, spaces.Dict):
-        return {"type": kind, "spaces": {key: describe_space(item) for key, item in space.items()}}
-    if isinstance(space, spaces.Box):
-        bounds = {"low": _shorten(space.low), "high": _shorten(space.high)}
-        return {
-            "type": kind,
-            "shape": list(space.shape),
-            "dtype": np.dtype(space.dtype).name,
-            **bounds,
-        }
-    if isinstance(space, spaces.Discrete):
-        return {"type": kind, "n": int(space.n), "start": int(space.start)}
-    if isinstance(space, spaces.MultiDiscrete):
-        return {"type": kind, "nvec": space.nvec.tolist()}
-    if isinstance(space, spaces.MultiBinary):
-        return {
-            "type": kind,
-            "n": list(space.n) if isinstance(space.n, tuple | list) else int(space.n),
-        }
-    return {"type": kind, "text": repr(space)}
-
-
-def _shorten(bound: Any) -> Any:
-    """A bound that is the same everywhere as one number."""
-    values = np.unique(bound)
-    return float(values[0]) if values.size == 1 else bound.tolist()
-
-
-def find_differences(saved: Any, found: Any, name: str) -> list[str]:
-    """What differs between two descriptions, a line for each entry.
-
-    :param saved: from the file
-    :param found: of the env
-    :param name: what is described
-    """
-    if (
-        isinstance(saved, dict)
-        and isinstance(found, dict)
-        and saved.get("type") == found.get("type")
-    ):
-        keys = {**saved, **found}
-        pairs = [
-            (saved.get(key, "missing"), found.get(key, "missing"), f"{name}.{key}") for key in keys
-        ]
-        return [line for pair in pairs for line in find_differences(*pair)]
-    if isinstance(saved, dict) and isinstance(found, dict):
-        return find_differences(saved["type"], found["type"], f"{name}.type")
-    return (
-        []
-        if saved == found
-        else [f"{name} is {reprlib.repr(saved)} in the file and {reprlib.repr(found)} in the env"]
-    )

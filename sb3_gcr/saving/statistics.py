@@ -9,11 +9,20 @@ import numpy as np
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
+#: What VecNormalize begins to count from, less than one observation.
+_NOTHING_SEEN = 1
+
 
 def _of_observations(vec_normalize: VecNormalize) -> dict[str, RunningMeanStd]:
     """VecNormalize's statistics of observations by key, "" where they have none."""
     found = getattr(vec_normalize, "obs_rms", None) or {}
     return found if isinstance(found, dict) else {"": found}
+
+
+def _count_seen(vec_normalize: VecNormalize) -> float:
+    """How many observations or returns VecNormalize has seen."""
+    moments = (*_of_observations(vec_normalize).values(), vec_normalize.ret_rms)
+    return max(float(one.count) for one in moments)
 
 
 def describe_statistics(vec_normalize: VecNormalize) -> dict[str, Any]:
@@ -35,6 +44,40 @@ def _describe_moments(moments: RunningMeanStd) -> dict[str, Any]:
     }
 
 
+def find_mismatch(
+    vec_normalize: VecNormalize | None, saved: Mapping[str, Any] | None
+) -> str | None:
+    """What a model would see otherwise than it has learned to, as a sentence; None if nothing.
+
+    :param vec_normalize: the wrapper of a model's env, None where it has none
+    :param saved: of ``describe_statistics``, None where the saved model's env had no VecNormalize
+    """
+    before = saved is not None and bool(saved["observations"])
+    now = (
+        vec_normalize is not None
+        and vec_normalize.norm_obs
+        and bool(_of_observations(vec_normalize))
+    )
+    if saved is not None and vec_normalize is None:
+        what = "observations" if before else "rewards"
+        return (
+            "The model has learned under VecNormalize, whose statistics are in its file, and the "
+            f"env has none: its {what} are in other units. Wrap it with `VecNormalize(env)`; to "
+            "evaluate, with `VecNormalize(env, training=False, norm_reward=False)`."
+        )
+    if before and not now:
+        return (
+            "The model has learned from observations that VecNormalize has normalised, and that of "
+            "the env leaves them as they are. Set its `norm_obs=True`."
+        )
+    if now and not before:
+        return (
+            "The model has learned from observations as they are, and the env's VecNormalize "
+            "normalises them. Set its `norm_obs=False`."
+        )
+    return None
+
+
 def restore_statistics(
     vec_normalize: VecNormalize, saved: Mapping[str, Any], returns: bool = True
 ) -> bool:
@@ -47,9 +90,9 @@ def restore_statistics(
     :return: whether they were restored
     :raises ValueError: if the saved statistics are of other observations
     """
-    observations = _of_observations(vec_normalize)
-    if any(moments.count >= 1 for moments in (*observations.values(), vec_normalize.ret_rms)):
+    if _count_seen(vec_normalize) >= _NOTHING_SEEN:
         return False
+    observations = _of_observations(vec_normalize)
     if observations and saved["observations"] and set(observations) != set(saved["observations"]):
         raise ValueError(
             "VecNormalize must normalise the observations that it did for the saved model, "

@@ -232,60 +232,6 @@ def test_sb3_reads_our_files_and_we_read_those_without_our_entry(tmp_path: Path)
     assert th.equal(parameters(PPO.load(tmp_path / "one")), parameters(one))
 
 
-# === VecNormalize ===
-
-
-@pytest.mark.parametrize(
-    ("observation", "kwargs"),
-    [
-        ("Box", {}),
-        ("Box", {"norm_obs": False}),
-        ("DictImage", {"norm_obs_keys": ["a"]}),
-        ("Image", {"norm_reward": False}),
-    ],
-)
-def test_statistics_come_back_exactly(tmp_path: Path, observation: str, kwargs: Any) -> None:
-    policy = {"Box": "MlpPolicy", "DictImage": "MultiInputPolicy", "Image": "MlpPolicy"}[
-        observation
-    ]
-    env = normalized(observation, **kwargs)
-    model = GCRPPO(policy, env, **SMALL).learn(64)
-    model.save(tmp_path / "model")
-    fresh = normalized(observation, **kwargs)
-    GCRPPO.load(tmp_path / "model", env=fresh)
-    np.testing.assert_array_equal(statistics(fresh), statistics(env))
-    actions = np.zeros((2, 2))
-    for venv in (fresh, env):
-        venv.seed(1)
-        venv.reset()
-    np.testing.assert_equal(fresh.step(actions)[:2], env.step(actions)[:2])  # and go on as before
-
-
-def test_a_vec_normalize_that_has_seen_something_keeps_its_own(tmp_path: Path) -> None:
-    model = GCRPPO("MlpPolicy", normalized(), **SMALL).learn(64)
-    model.save(tmp_path / "model")
-    env = normalized()
-    env.reset()
-    before = statistics(env)
-    GCRPPO.load(tmp_path / "model", env=env)
-    np.testing.assert_array_equal(statistics(env), before)
-    GCRPPO.load(tmp_path / "model", env=make_vec_env(Env, 2))  # without VecNormalize: as ever
-
-
-def test_statistics_of_other_observations_are_refused(tmp_path: Path) -> None:
-    GCRPPO("MultiInputPolicy", normalized("DictImage", norm_obs_keys=["a"]), **SMALL).save(
-        tmp_path / "model"
-    )
-    message = (
-        "VecNormalize must normalise the observations that it did for the saved model, ['a'], "
-        "found ['i']."
-    )
-    env = normalized("DictImage", norm_obs_keys=["i"])
-    env.observation_space = normalized("DictImage", norm_obs_keys=["a"]).observation_space
-    with pytest.raises(ValueError, match=exactly(message)):
-        GCRPPO.load(tmp_path / "model", env=env)
-
-
 # === The newest checkpoint ===
 
 
