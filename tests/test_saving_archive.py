@@ -381,13 +381,15 @@ def test_files_without_plain_settings_are_refused(path: Path) -> None:
         ),
         (
             {"counters": {"policy": 3}},
-            "The counters in a file must be numbers named ['_has_paid', 'num_timesteps', '_n_updates', "
+            "The counters in a file must be numbers named ['_has_paid', 'num_timesteps', "
+            "'_n_updates', "
             "'_n_rollouts_learned', "
             "'_adaptive_learning_rate'], found policy=3.",
         ),
         (
             {"counters": {"num_timesteps": "many"}},
-            "The counters in a file must be numbers named ['_has_paid', 'num_timesteps', '_n_updates', "
+            "The counters in a file must be numbers named ['_has_paid', 'num_timesteps', "
+            "'_n_updates', "
             "'_n_rollouts_learned', "
             "'_adaptive_learning_rate'], found num_timesteps='many'.",
         ),

@@ -104,7 +104,7 @@ def test_a_setting_that_an_old_file_lacks_is_what_it_was_then(tmp_path: Path) ->
             assert old.surrogate_clipping == "component"
             given = {"surrogate_clipping": "joint", "weights_only": weights_only}
             assert load(OLD, env=env(), **given).surrogate_clipping == "joint"
-    new = Younger("MlpPolicy", env(), **SMALL)
+    new = GCRPPO("MlpPolicy", env(), **SMALL)
     new.save(tmp_path / "new")
     assert GCRPPO.load(tmp_path / "new").surrogate_clipping == "joint"
 
