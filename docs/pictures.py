@@ -91,6 +91,48 @@ def counterexample() -> Figure:
     return figure
 
 
+def clipping() -> Figure:
+    """Surrogate of one sample with two advantages of opposite sign, against its ratio."""
+    ratio = np.linspace(0.6, 1.6, 401)
+    advantages = np.array([2.0, -1.0])
+    clipped = ratio.clip(0.8, 1.2)
+    by_component = np.minimum(ratio * advantages[:, None], clipped * advantages[:, None])
+    total = advantages.sum()
+    is_clipped = ratio * total > clipped * total
+    jointly = np.where(is_clipped, clipped, ratio) * advantages[:, None]
+    figure = Figure(figsize=(8.2, 3.4), layout="constrained")
+    panels = {"component by component": by_component, "one clip per sample": jointly}
+    for axis, (title, surrogates) in zip(
+        figure.subplots(1, 2, sharey=True), panels.items(), strict=True
+    ):
+        axis.axvspan(0.8, 1.2, color="#e8f1e9", zorder=0)
+        for surrogate, advantage, colour in zip(
+            surrogates, advantages, (BLUE, ORANGE), strict=True
+        ):
+            axis.plot(ratio, surrogate, color=colour, label=f"advantage {advantage:+.0f}")
+        axis.plot(ratio, surrogates.sum(0), color=RED, lw=2.8, label="their sum")
+        axis.set(title=title, xlabel="ratio ρ")
+        axis.grid(alpha=0.3)
+    axes = figure.axes
+    axes[0].set_ylabel("surrogate of one sample")
+    axes[0].annotate(
+        "pushes back",
+        xy=(1.45, 0.95),
+        xytext=(1.25, 1.9),
+        color=RED,
+        arrowprops={"arrowstyle": "->", "color": RED},
+    )
+    axes[1].annotate(
+        "PPO's: flat",
+        xy=(1.45, 1.2),
+        xytext=(1.25, 1.9),
+        color=RED,
+        arrowprops={"arrowstyle": "->", "color": RED},
+    )
+    axes[1].legend(loc="center right", fontsize=9)
+    return figure
+
+
 def training(timesteps: int, folder: str) -> EventAccumulator:
     """Train on HalfCheetah with a TensorBoard log, and read that."""
     env = VecNormalize(
@@ -137,13 +179,15 @@ def main() -> None:
     """Make all pictures, or those that are named."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "names", nargs="*", metavar="NAME", help="counterexample, conflict (default: both)"
+        "names", nargs="*", metavar="NAME", help="counterexample, clipping, conflict (default: all)"
     )
     parser.add_argument(
         "--timesteps", type=int, default=100_000, help="of the training for `conflict`"
     )
     arguments = parser.parse_args()
-    names = arguments.names or ["counterexample", "conflict"]
+    names = arguments.names or ["counterexample", "clipping", "conflict"]
+    if "clipping" in names:
+        clipping().savefig(IMAGES / "clipping.png", dpi=130)
     if "counterexample" in names:
         counterexample().savefig(IMAGES / "counterexample.png", dpi=130)
     if "conflict" in names:
