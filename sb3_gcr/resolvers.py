@@ -65,9 +65,9 @@ def by_levels(gramian: Gramian, levels: Levels, rng: np.random.Generator) -> Wei
     the sums of the higher levels where they conflict.
 
     T_l' ← T_l' - min(0, ⟨T_l', T_h⟩) / |T_h|² · T_h for h = l-1 … 0, with the original T_h. Weights
-    are the same inside a level, so the reward's own weights decide there. With two levels no
-    regulariser weakens the sum of the tasks, however many there are:
-    Σ_tasks (G w) ≥ 1ᵀ G 1 over the tasks.
+    are the same inside a level (1 for a component without gradient), so the reward's own weights
+    decide there. With two levels no regulariser weakens the sum of the tasks, however many there
+    are: Σ_tasks (G w) ≥ 1ᵀ G 1 over the tasks.
 
     :param gramian: G, shape (K, K)
     :param levels: priority level of each component, 0 the highest, shape (K,)
@@ -76,7 +76,9 @@ def by_levels(gramian: Gramian, levels: Levels, rng: np.random.Generator) -> Wei
     """
     ranks, level_of = np.unique(levels, return_inverse=True)
     members = np.eye(len(ranks))[:, level_of]  # (levels, K)
-    return fast_gcr.gcr(members @ gramian @ members.T, ranks, rng)[level_of]
+    weights = fast_gcr.gcr(members @ gramian @ members.T, ranks, rng)[level_of]
+    squared_norms = gramian.diagonal()
+    return np.where(squared_norms > ZERO_ROW * squared_norms.max(), weights, 1.0)
 
 
 def gcr_authors(gramian: Gramian, levels: Levels, rng: np.random.Generator) -> Weights:

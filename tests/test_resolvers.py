@@ -321,3 +321,49 @@ def test_conflicts_and_cosines() -> None:
     np.testing.assert_allclose(
         cosines(gramian), [[1, -(0.5**0.5), 0], [-(0.5**0.5), 1, 0], [0, 0, 0]]
     )
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_tasks=st.integers(1, 5),
+    n_regularisers=st.integers(1, 5),
+    size=st.integers(1, 8),
+)
+@settings(max_examples=1000, deadline=None)
+def test_levels_never_weakens_the_sum_of_the_tasks(
+    seed: int, n_tasks: int, n_regularisers: int, size: int
+) -> None:
+    """Two levels, any Gramian: ⟨d, Σ tasks⟩ ≥ |Σ tasks|², and equal weights inside a level."""
+    rng = np.random.default_rng(seed)
+    jacobian = random_jacobian(rng, n_tasks + n_regularisers, size)
+    levels = np.array([0] * n_tasks + [1] * n_regularisers)
+    weights = RESOLVERS["levels"](jacobian @ jacobian.T, levels, rng)
+    tasks, regularisers = jacobian[levels == 0].sum(0), jacobian[levels == 1].sum(0)
+    scale = np.square(jacobian).sum()
+    assert (weights @ jacobian) @ tasks >= tasks @ tasks - 1e-9 * scale
+    assert np.ptp(weights[levels == 0]) == np.ptp(weights[levels == 1]) == 0
+    if tasks @ regularisers >= 0:
+        np.testing.assert_array_equal(weights, np.ones(len(levels)))
+
+
+def test_levels_by_hand() -> None:
+    """T_0 = (1, 0) of two tasks that conflict, T_1 = (-2, 1): projected off T_0 it is (0, 1)."""
+    jacobian = [[3.0, 1.0], [-2.0, -1.0], [-2.0, 1.0]]
+    actual = step(RESOLVERS["levels"], jacobian, [0, 0, 1])
+    np.testing.assert_allclose(actual, [1.0, 1.0])
+    gramian = np.array(jacobian) @ np.array(jacobian).T
+    weights = RESOLVERS["levels"](gramian, np.array([0, 0, 1]), np.random.default_rng(0))
+    np.testing.assert_allclose(weights, [3.0, 3.0, 1.0])
+
+
+def test_levels_scale_and_order_do_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    jacobian = random_jacobian(rng, 6, 4)
+    levels = np.array([0, 1, 2, 1, 0, 2])
+    weights = RESOLVERS["levels"](jacobian @ jacobian.T, levels, rng)
+    for scale in (1e-8, 1e8):
+        scaled = RESOLVERS["levels"](scale * jacobian @ jacobian.T, levels, rng)
+        np.testing.assert_allclose(scaled, weights, rtol=1e-9)
+    order = rng.permutation(6)
+    moved = RESOLVERS["levels"](jacobian[order] @ jacobian[order].T, levels[order], rng)
+    np.testing.assert_allclose(moved, weights[order], rtol=1e-9)
