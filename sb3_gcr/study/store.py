@@ -2,7 +2,7 @@
 
 ::
 
-    study.yml                  the manifest, expanded: name, digest, n_cells, tasks, methods, seeds …
+    study.yml                  the manifest, expanded: name, digest, n_cells, tasks, methods, seeds
     cells/<id>/result.json     of a finished cell
     cells/<id>/error.json      of a cell that failed; `attempts` says how often
     cells/<id>/log.txt         what the cell printed, all attempts
