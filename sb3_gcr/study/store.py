@@ -46,11 +46,11 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
 import socket
 import time
 import uuid
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -218,6 +218,16 @@ def collect(folder: str | Path) -> Collected:
     )
 
 
+def load_result(store: Store, cell_id: str) -> Record:
+    """The result of a cell that is done.
+
+    :param store: the folder
+    :param cell_id: of the cell
+    """
+    record: Record = json.loads(store.path(cell_id, RESULT).read_text(encoding="utf-8"))
+    return record
+
+
 def plain(value: Any) -> Any:
     """The same in JSON's own types; numbers that are not finite become None.
 
@@ -262,10 +272,8 @@ def _take_away(path: Path) -> None:
 
 def _put_back(taken: Path, path: Path) -> None:
     """Another runner was faster and this is its new claim; a link fails where one is there."""
-    try:
+    with suppress(OSError):
         os.link(taken, path)
-    except OSError:
-        shutil.rmtree(taken, ignore_errors=True)
 
 
 def _age(path: Path) -> float | None:
