@@ -69,6 +69,8 @@ HELD_OUT = (
     "G1",
     "LeapCube",
 )
+#: What only the folder's ``study.yml`` has, beside the manifest.
+WRITTEN = ("digest", "n_cells", "registered")
 _KEYS = {
     "name",
     "purpose",
@@ -192,15 +194,7 @@ class Manifest:
         :raises FileNotFoundError: if there is neither
         :raises ValueError: for unknown, missing and wrong entries
         """
-        file = Path(path)
-        shipped = Path(__file__).with_name("studies")
-        if not file.is_file():
-            file = shipped / f"{path}.yml"
-        if not file.is_file():
-            names = sorted(one.stem for one in shipped.glob("*.yml"))
-            raise FileNotFoundError(
-                f"Parameter `manifest` must be a YAML file or one of {names}, found {str(path)!r}."
-            )
+        file = find(path)
         return cls.from_dict(_load_yaml(file.read_text(encoding="utf-8"), str(file)))
 
     @classmethod
@@ -212,12 +206,12 @@ class Manifest:
         """
         if not isinstance(given, Mapping):
             raise ValueError(f"A manifest must map names to values, found {given!r}.")
-        given = {key: value for key, value in given.items() if key not in ("digest", "n_cells")}
+        given = {key: value for key, value in given.items() if key not in WRITTEN}
         name = str(given.get("name", "?"))
         _check_keys(
             given, _KEYS, {"name", "methods", "seeds", "minutes", "tasks"}, f"Study '{name}'"
         )
-        methods = tuple(named(list(given["methods"])))
+        methods = tuple(named(given["methods"]))
         purpose = given.get("purpose", "study")
         manifest = cls(
             name=name,
@@ -261,6 +255,22 @@ class Manifest:
         more = set(self.seeds) >= set(before.seeds) and set(self.methods) >= set(before.methods)
         fixed = self.tasks == before.tasks and self.name == before.name
         return more and fixed and not (self.hypotheses or before.hypotheses)
+
+
+def find(path: str | Path) -> Path:
+    """The file of a manifest.
+
+    :param path: of the file, or the name of a manifest of this package
+    :raises FileNotFoundError: if there is neither
+    """
+    shipped = Path(__file__).with_name("studies")
+    for file in (Path(path), shipped / f"{path}.yml"):
+        if file.is_file():
+            return file
+    names = sorted(one.stem for one in shipped.glob("*.yml"))
+    raise FileNotFoundError(
+        f"Parameter `manifest` must be a YAML file or one of {names}, found {str(path)!r}."
+    )
 
 
 def cell_id(canonical: Fields) -> str:

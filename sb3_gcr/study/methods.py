@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -60,29 +60,27 @@ ALIASES = {"gcrppo": "gcr"}
 WITHOUT_SURGERY = ("ppo", "multi_head", "multi_head_component")
 
 
-def named(names: list[str]) -> list[str]:
+def named(names: Sequence[str]) -> list[str]:
     """The methods behind names, without repetitions.
 
     :param names: of methods
-    :raises ValueError: for an unknown name, and for what this version cannot do yet
+    :raises ValueError: for an unknown name
     """
     found = list(dict.fromkeys(ALIASES.get(name, name) for name in names))
     unknown = [name for name in found if name not in METHODS]
     if unknown:
         raise ValueError(f"Unknown methods {unknown}; valid choices are {[*METHODS, *ALIASES]}.")
-    for name in found:
-        _check_available(name)
     return found
 
 
-def with_heads(names: list[str]) -> list[str]:
+def with_heads(names: Sequence[str]) -> list[str]:
     """The same methods, and the heads alone where surgery is compared with PPO.
 
     :param names: of methods
     """
     has_surgery = any(name not in WITHOUT_SURGERY for name in names)
     if "ppo" not in names or not has_surgery or "multi_head" in names:
-        return names
+        return list(names)
     place = names.index("ppo") + 1
     return [*names[:place], "multi_head", *names[place:]]
 
@@ -109,7 +107,12 @@ def has_surrogate_clipping() -> bool:
     return "surrogate_clipping" in inspect.signature(GCRPPO).parameters
 
 
-def _check_available(name: str) -> None:
+def check_available(name: str) -> None:
+    """Refuse a method that this version of sb3_gcr cannot run.
+
+    :param name: of a method
+    :raises ValueError: for one that it cannot
+    """
     method = METHODS[name]
     if method.resolver not in RESOLVERS:
         raise ValueError(

@@ -170,7 +170,7 @@ class Store:
         :param result: as above; numbers that are not finite become null
         """
         _write(self.path(cell_id, RESULT), result)
-        self.path(cell_id, ERROR).unlink(missing_ok=True)
+        self.forget_error(cell_id)
 
     def write_error(self, cell_id: str, cell: Record, error: str) -> None:
         """Count a failed attempt.
@@ -187,6 +187,13 @@ class Store:
             "log_tail": self.log_tail(cell_id),
         }
         _write(self.path(cell_id, ERROR), record)
+
+    def forget_error(self, cell_id: str) -> None:
+        """Let a failed cell be tried again.
+
+        :param cell_id: of the cell
+        """
+        self.path(cell_id, ERROR).unlink(missing_ok=True)
 
     def log_tail(self, cell_id: str) -> str:
         """The last lines of the cell's log."""
