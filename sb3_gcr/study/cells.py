@@ -20,7 +20,7 @@ from sb3_gcr.gcrppo import GCRPPO
 from sb3_gcr.resolvers import RESOLVERS
 from sb3_gcr.rewards.reading import find_reward_spec
 from sb3_gcr.rewards.spec import RewardSpec
-from sb3_gcr.study.environments import make_envs, no_components_message, show
+from sb3_gcr.study.environments import Shown, make_envs, no_components_message
 from sb3_gcr.study.manifest import cell_id
 from sb3_gcr.study.methods import has_surrogate_clipping, trained_spec
 from sb3_gcr.study.provenance import provenance
@@ -72,11 +72,11 @@ def run_cell(cell: Fields, threads: int = 1) -> dict[str, Any]:
     started, wall, cpu = time.time(), time.perf_counter(), time.process_time()
     envs = training_envs(cell, threads)
     spec = spec_of(envs, cell)
-    show(envs, trained_spec(cell["algorithm"], spec))
     training = normalised(envs, cell)
     resolver = WatchedResolver(RESOLVERS[cell["algorithm"]["resolver"]])
-    model = make_model(cell, training, resolver)
-    assert model.reward_spec == trained_spec(cell["algorithm"], spec)
+    intended = trained_spec(cell["algorithm"], spec)
+    model = make_model(cell, Shown(training, intended), resolver)
+    assert model.reward_spec == intended, f"{model.reward_spec} is not {intended}"
     recorder = Recorder(spec.names, resolver, whole_rollouts(cell))
     model.learn(cell["timesteps"], callback=recorder)
     trained = time.perf_counter()

@@ -11,11 +11,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import (
+    VecEnvIndices,
+    VecEnvObs,
+    VecEnvStepReturn,
+)
 
 from sb3_gcr.envs import BatchedVecEnv
 from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS, RewardDecomposition
-from sb3_gcr.rewards.reading import find_reward_spec
 from sb3_gcr.rewards.spec import COMPONENTS_KEY, ERROR_KEY, RewardSpec
 from sb3_gcr.simulators.envpool_gym import pool_of
 
@@ -91,17 +95,34 @@ def make_envs(cell: Mapping[str, Any], n_envs: int, seed: int, n_threads: int = 
     )
 
 
-def show(envs: VecEnv, spec: RewardSpec) -> None:
-    """Let the envs claim these components, which the update then works with.
+class Shown(VecEnvWrapper):
+    """The same envs, which claim other components: those that an update is to work with.
 
-    :param envs: of :func:`make_envs`
-    :param spec: what they shall claim
+    :param venv: the envs, VecNormalize included
+    :param spec: what they claim
     """
-    if isinstance(getattr(envs, "reward_spec", None), RewardSpec):
-        envs.reward_spec = spec  # type: ignore[attr-defined]
-    else:
-        envs.set_attr("reward_spec", spec)
-    assert find_reward_spec(envs) == spec
+
+    def __init__(self, venv: VecEnv, spec: RewardSpec):
+        super().__init__(venv)
+        self.reward_spec = spec
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """An attribute of the envs.
+
+        :param attr_name: its name
+        :param indices: of the envs
+        """
+        if attr_name == "reward_spec":
+            return [self.reward_spec] * len(list(self._get_indices(indices)))
+        return self.venv.get_attr(attr_name, indices)
+
+    def reset(self) -> VecEnvObs:
+        """Start all episodes."""
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step all envs."""
+        return self.venv.step_wait()
 
 
 def make_one(cell: Mapping[str, Any]) -> Env:

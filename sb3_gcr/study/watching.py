@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_gcr.resolvers import Resolver, conflicts, cosines
+from sb3_gcr.angles import conflicts, cosines
+from sb3_gcr.resolvers import Resolver
 
 #: Equal parts of a training, each with one number of everything.
 WINDOWS = 50
