@@ -22,7 +22,7 @@ from sb3_gcr.rewards.reading import find_reward_spec
 from sb3_gcr.rewards.spec import RewardSpec
 from sb3_gcr.study.environments import Shown, make_envs, no_components_message
 from sb3_gcr.study.manifest import cell_id
-from sb3_gcr.study.methods import has_surrogate_clipping, trained_spec
+from sb3_gcr.study.methods import trained_spec
 from sb3_gcr.study.provenance import provenance
 from sb3_gcr.study.settings import MODEL, OURS, policy_kwargs
 from sb3_gcr.study.store import SCHEMA, plain
@@ -167,11 +167,10 @@ def make_model(cell: Fields, envs: VecEnv, resolver: WatchedResolver) -> GCRPPO:
     :param resolver: of the cell's method
     """
     settings = cell["settings"] | cell["algorithm"]["overrides"]
-    ours = [name for name in OURS if name != "surrogate_clipping" or has_surrogate_clipping()]
     return GCRPPO(
         settings["policy"],
         envs,
-        **{name: settings[name] for name in (*MODEL, *ours)},
+        **{name: settings[name] for name in (*MODEL, *OURS)},
         policy_kwargs=policy_kwargs(settings),
         seed=SEED_STRIDE * cell["seed"],
         device="cpu",

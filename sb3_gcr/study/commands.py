@@ -16,7 +16,6 @@ from sb3_gcr.study.costs import Costs, estimate
 from sb3_gcr.study.engines import Engine, LocalEngine, RayEngine
 from sb3_gcr.study.folders import open_folder
 from sb3_gcr.study.manifest import Cell, Manifest, blocks, expand, find
-from sb3_gcr.study.methods import check_available
 from sb3_gcr.study.probe import probe, shown
 from sb3_gcr.study.runner import Limits, Progress, Runner
 from sb3_gcr.study.store import ERROR, MANIFEST, Store, collect
@@ -83,8 +82,6 @@ def run_manifest(manifest: Manifest, options: argparse.Namespace, source: Path |
     :param options: of the command line
     :param source: the manifest's file
     """
-    for method in manifest.methods:
-        check_available(method)
     shard, n_shards = shard_of(options.shard)
     folder = folder_of(options, manifest)
     store = open_folder(manifest, folder, source)
@@ -195,7 +192,6 @@ def cell(options: argparse.Namespace) -> int:
         raise ValueError(
             f"'{manifest.name}' has no cell {options.id!r}; `{PROGRAM} plan --cells` lists them."
         )
-    check_available(found[0].method)
     store = open_folder(manifest, folder_of(options, manifest), find(options.manifest))
     store.forget_error(options.id)
     claim = store.claim(options.id)
@@ -255,8 +251,6 @@ def compare(options: argparse.Namespace) -> int:
         residual_of(options.residual),
         comparing.pairs(options.settings, "--settings"),
     )
-    for method in manifest.methods:
-        check_available(method)
     options.manifest = str(Path(options.out) / MANIFEST)
     first = expand(manifest)[0]
     say(shown(probe(first.canonical())))

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sb3_gcr.gcrppo import GCRPPO
-from sb3_gcr.resolvers import RESOLVERS
 from sb3_gcr.rewards.spec import SCALAR_REWARD, RewardSpec
 
 #: Where the levels of the components come from.
@@ -100,27 +97,3 @@ def trained_spec(method: Mapping[str, Any], spec: RewardSpec) -> RewardSpec:
         lowest = max(spec.levels)
         return RewardSpec(spec.names, tuple(lowest - level for level in spec.levels))
     return spec
-
-
-def has_surrogate_clipping() -> bool:
-    """Whether GCRPPO has the argument `surrogate_clipping`; without it, it clips by component."""
-    return "surrogate_clipping" in inspect.signature(GCRPPO).parameters
-
-
-def check_available(name: str) -> None:
-    """Refuse a method that this version of sb3_gcr cannot run.
-
-    :param name: of a method
-    :raises ValueError: for one that it cannot
-    """
-    method = METHODS[name]
-    if method.resolver not in RESOLVERS:
-        raise ValueError(
-            f"Method '{name}' needs the resolver '{method.resolver}', which this version of "
-            f"sb3_gcr does not have: it has {sorted(RESOLVERS)}. Leave the method out."
-        )
-    if method.overrides and not has_surrogate_clipping():
-        raise ValueError(
-            f"Method '{name}' needs GCRPPO's argument `surrogate_clipping`, which this version of "
-            "sb3_gcr does not have. Leave the method out."
-        )
