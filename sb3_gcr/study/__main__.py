@@ -70,6 +70,9 @@ def _add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hours", type=float, help="nothing begins that cannot end within")
     parser.add_argument("--minutes", type=float, help="a cell that takes longer has failed")
     parser.add_argument("--shard", metavar="K/N", help="every N-th block, from the K-th on")
+    parser.add_argument(
+        "--reuse", nargs="+", default=[], metavar="FOLDER", help="take over equal cells of studies"
+    )
     parser.add_argument("--engine", choices=["local", "ray"], default="local")
     parser.add_argument("--address", help="of a Ray cluster, such as auto")
 

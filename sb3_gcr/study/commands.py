@@ -14,7 +14,7 @@ from sb3_gcr.logs.shown import format_table
 from sb3_gcr.study import compare as comparing
 from sb3_gcr.study.costs import Costs, estimate
 from sb3_gcr.study.engines import Engine, LocalEngine, RayEngine
-from sb3_gcr.study.folders import open_folder
+from sb3_gcr.study.folders import open_folder, reuse
 from sb3_gcr.study.manifest import Cell, Manifest, blocks, expand, find
 from sb3_gcr.study.probe import probe, shown
 from sb3_gcr.study.runner import Limits, Progress, Runner
@@ -91,6 +91,8 @@ def run_manifest(manifest: Manifest, options: argparse.Namespace, source: Path |
         hours=options.hours,
         minutes=options.minutes or manifest.minutes,
     )
+    if options.reuse:
+        say(f"{reuse(store, expand(manifest), options.reuse)} cells taken over.")
     own = [block for place, block in enumerate(blocks(manifest)) if place % n_shards == shard]
     failed = Runner(own, store, make_engine(options, store), limits, ProgressLine()).run()
     for line in failures(failed, store):

@@ -57,6 +57,7 @@ class LocalEngine:
         :param cell: to run
         """
         request = {
+            "id": cell.id,
             "cell": cell.canonical(),
             "folder": str(self.store.folder.resolve()),
             "threads": self.threads,

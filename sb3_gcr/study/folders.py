@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_gcr.study.manifest import Manifest
+from sb3_gcr.study.manifest import Cell, Manifest
 from sb3_gcr.study.provenance import git
-from sb3_gcr.study.store import MANIFEST, Store
+from sb3_gcr.study.store import MANIFEST, Store, collect
 
 
 def open_folder(manifest: Manifest, folder: Path, source: Path | None = None) -> Store:
@@ -34,6 +35,25 @@ def open_folder(manifest: Manifest, folder: Path, source: Path | None = None) ->
     )
     temporary.replace(path)
     return Store(folder)
+
+
+def reuse(store: Store, cells: Sequence[Cell], folders: Sequence[str | Path]) -> int:
+    """Copy the results of cells that other studies have run; returns how many.
+
+    :param store: of this study
+    :param cells: of this study
+    :param folders: of other studies
+    :raises FileNotFoundError: if a folder is not there
+    """
+    wanted = {cell.id for cell in cells if not store.is_done(cell.id)}
+    copied = 0
+    for folder in folders:
+        for result in collect(folder).results:
+            if result["id"] in wanted:
+                store.write_result(result["id"], result)
+                wanted.remove(result["id"])
+                copied += 1
+    return copied
 
 
 def _demand_growth(manifest: Manifest, before: Manifest, folder: Path) -> None:

@@ -37,6 +37,14 @@ def probe(cell: Mapping[str, Any]) -> list[Term]:
     :raises ValueError: if there are none, one is missing or not finite, or they do not sum to the
         reward
     """
+    try:
+        return _probe(cell)
+    except ValueError as error:
+        help_here = " Here: `--residual rest`." if "residual=" in str(error) else ""
+        raise ValueError(f"{error}{help_here}") from error
+
+
+def _probe(cell: Mapping[str, Any]) -> list[Term]:
     env = make_one(cell)
     given = env.get_wrapper_attr("reward_spec")
     spec = given if isinstance(given, RewardSpec) else RewardSpec.from_dict(given)
@@ -49,7 +57,7 @@ def probe(cell: Mapping[str, Any]) -> list[Term]:
     for _ in range(STEPS):
         _, reward, terminated, truncated, info = env.step(env.action_space.sample())
         if COMPONENTS_KEY not in info:
-            raise ValueError(_way_out(info.get(ERROR_KEY) or no_components_message(info)))
+            raise ValueError(info.get(ERROR_KEY) or no_components_message(info))
         rows.append(np.asarray(info[COMPONENTS_KEY], dtype=float))
         rewards.append(float(reward))
         if terminated or truncated:
@@ -58,14 +66,9 @@ def probe(cell: Mapping[str, Any]) -> list[Term]:
     components = np.array(rows)
     fault = find_fault(components, np.array(rewards), spec, tolerance)
     if fault is not None:
-        raise ValueError(_way_out(f"Step {fault[0] + 1}: {fault[1]}"))
+        raise ValueError(f"Step {fault[0] + 1}: {fault[1]}")
     columns = zip(spec, components.T, strict=True)
     return [_term(name, level, column) for (name, level), column in columns]
-
-
-def _way_out(fault: str) -> str:
-    """The same, and what helps on the command line."""
-    return f"{fault} Here: `--residual rest`." if "residual=" in fault else fault
 
 
 def _term(name: str, level: int, values: Any) -> Term:
