@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from importlib import import_module
 from typing import IO, Any, NamedTuple, Protocol
 
 from sb3_gcr.study.manifest import Cell
@@ -130,7 +131,7 @@ class RayEngine:
         self, store: Store, threads: int = 1, address: str | None = None, jobs: int | None = None
     ):
         try:
-            import ray
+            ray: Any = import_module("ray")
         except ImportError as error:
             raise ImportError(
                 f"`--engine ray` needs Ray: pip install 'sb3_gcr[ray]' ({error})"
@@ -138,7 +139,7 @@ class RayEngine:
         self._ray, self.store = ray, store
         names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
         environment: dict[str, Any] = {"env_vars": dict.fromkeys(names, str(threads))}
-        started_here = {} if address else {"num_cpus": (jobs or 1) * threads}
+        started_here: dict[str, int] = {} if address else {"num_cpus": (jobs or 1) * threads}
         if not address:  # modules beside the command are importable there too
             environment["env_vars"]["PYTHONPATH"] = os.pathsep.join([os.getcwd(), *sys.path])
         ray.init(
