@@ -156,11 +156,14 @@ def armsp_range(distances: Array, bounds: tuple[float, float]) -> Array:
 class HumanoidRun(Task):
     """Gymnasium's humanoid runs towards a point 1000 m ahead; seven terms, with the paper's weights
     and levels.
+
+    :param regulariser_weight: multiplies the three regularisers
     """
 
     n_substeps = N_SUBSTEPS
 
-    def __init__(self) -> None:
+    def __init__(self, regulariser_weight: float = 1.0) -> None:
+        self.regulariser_weight = regulariser_weight
         self.model = humanoid_model()
         self.reward_spec = RewardSpec.from_dict(
             {
@@ -205,9 +208,9 @@ class HumanoidRun(Task):
             alive(s.qpos[:, 2]),
             upright(up),
             move_to_target(heading),
-            action_l2(s.actions),
-            energy(s.actions, self.actuated_velocities(s)),
-            joint_pos_limits(self._scaled(s)),
+            self.regulariser_weight * action_l2(s.actions),
+            self.regulariser_weight * energy(s.actions, self.actuated_velocities(s)),
+            self.regulariser_weight * joint_pos_limits(self._scaled(s)),
         ]
 
     def terminated(self, s: Rows) -> NDArray[np.bool_]:
