@@ -61,7 +61,7 @@ def test_logged_losses_add_up_to_ppos(clipping: str) -> None:
     _, _, model = trained_actor(GCRPPO, "Box", **kwargs)
     key = "train/policy_gradient_loss"
     found, expected = (m.logger.name_to_value[key] for m in (model, ppo))
-    assert (abs(found - expected) < 1e-5) is (clipping == "joint")
+    assert bool(abs(found - expected) < 1e-5) is (clipping == "joint")
     assert found >= expected - 1e-5
 
 
