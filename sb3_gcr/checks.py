@@ -37,8 +37,7 @@ def check_number(
     expected = f"{kind}{_range(low, high, above)}{' or None' if optional else ''}"
     message = f"Parameter `{name}` must be {expected}, found {value!r}."
     if isinstance(value, str):
-        hint = " That is text: YAML needs a dot in 1.0e-2." if _is_number(value) else ""
-        raise TypeError(f"{message}{hint}")
+        raise TypeError(f"{message}{text_hint(value)}")
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise TypeError(message)
     whole = not integer or isinstance(value, int | np.integer)
@@ -71,6 +70,15 @@ def _range(low: float, high: float, above: bool) -> str:
     if low > -math.inf:
         return f" {'>' if above else '≥'} {low:g}"
     return ""
+
+
+def text_hint(value: Any) -> str:
+    """What to add to an error about a number that is written as text; nothing for others.
+
+    :param value: what was given
+    """
+    is_text = isinstance(value, str) and _is_number(value)
+    return " That is text: YAML needs a dot in 1.0e-2." if is_text else ""
 
 
 def _is_number(text: str) -> bool:

@@ -86,7 +86,7 @@ ARROWS = {
     "saving.checkpoints": set(),
     "saving.statistics": set(),
     "saving.warm_start": set(),
-    "saving.settings": {"policies"},
+    "saving.settings": {"checks", "policies"},
     "saving.spaces": set(),
     "saving.unpickling": set(),
     "saving.archive": {

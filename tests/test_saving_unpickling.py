@@ -102,7 +102,7 @@ def test_a_setting_that_an_old_file_lacks_is_what_it_was_then(tmp_path: Path) ->
         for load in (GCRPPO.load, GCRPPO.warm_start):
             old = load(OLD, env=env(), device="cpu", weights_only=weights_only)
             assert old.surrogate_clipping == "component"
-            given = {"surrogate_clipping": "joint", "weights_only": weights_only}
+            given: Any = {"surrogate_clipping": "joint", "weights_only": weights_only}
             assert load(OLD, env=env(), **given).surrogate_clipping == "joint"
     new = GCRPPO("MlpPolicy", env(), **SMALL)
     new.save(tmp_path / "new")

@@ -141,6 +141,7 @@ class Saving(OnPolicyAlgorithm):
         :raises ValueError: if components or spaces are not those of the env, or the file cannot be
             read here; with ``weights_only`` if the file needs more, such as a class or function of
             its author's, and the arguments do not give it
+        :raises TypeError: for text where a setting is a number
         """
         if isinstance(env, str):
             raise ValueError(

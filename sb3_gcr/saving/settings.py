@@ -22,6 +22,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule
 from torch import nn
 
+from sb3_gcr.checks import text_hint
 from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
 #: Arguments of a model's constructor that are no settings.
@@ -128,15 +129,13 @@ def refuse_text(given: Mapping[str, Any], settings: Mapping[str, Any], where: st
     :param given: values by name
     :param settings: types of ``find_settings``
     :param where: where the values come from, for the error
-    :raises ValueError: names the setting, what it must be and what was found
+    :raises TypeError: names the setting, what it must be and what was found
     """
     for name, value in given.items():
         wanted = _number_or_switch(settings.get(name, Any))
-        if wanted is None or not isinstance(value, str | list | tuple | Mapping):
-            continue
-        found = f"the text {value!r}" if isinstance(value, str) else repr(value)
-        hint = " YAML takes 1e-3 for text, and 0.001 or 1.0e-3 for a number." if not where else ""
-        raise ValueError(f"Parameter `{name}` must be {wanted}, found {found}{where}.{hint}")
+        if wanted and isinstance(value, str | list | tuple | Mapping):
+            hint = text_hint(value) if not where else ""
+            raise TypeError(f"Parameter `{name}` must be {wanted}, found {value!r}{where}.{hint}")
 
 
 def _number_or_switch(kind: Any) -> str | None:
