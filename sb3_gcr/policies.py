@@ -29,6 +29,8 @@ class MultiHeadActorCriticPolicy(ActorCriticPolicy):
     """
 
     def __init__(self, *args: Any, n_components: int = 1, **kwargs: Any):
+        # Policies saved before the first release call it n_objectives.
+        n_components = kwargs.pop("n_objectives", n_components)
         self.n_components = n_components
         self._fuse_optimizer = (
             n_components > 1

@@ -16,7 +16,7 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_gcr import GCRPPO, RewardSpec
+from sb3_gcr import GCRPPO, MlpPolicy, RewardSpec
 from sb3_gcr.saving.unpickling import MOVED, Unpickler
 from tests.envs import SPEC, Env
 
@@ -24,6 +24,8 @@ SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 16, "n_epochs": 2, "seed":
 #: Saved by revision 7c8b671: 128 steps with resolver="guaranteed", desired_kl=0.01,
 #: gramian_samples=8 and net_arch=[4] on two normalised envs.
 OLD = Path(__file__).parent / "data/model_0.1.0.dev.zip"
+#: The policy of that model, saved alone by that revision.
+OLD_POLICY = OLD.with_name("policy_0.1.0.dev.pth")
 #: What that revision printed for it.
 ACTION = [-0.0028064020443707705, 0.06906496733427048]
 #: And what it printed after 64 steps more, seeded with 5.
@@ -75,6 +77,12 @@ def test_an_old_file_starts_a_new_model(weights_only: bool) -> None:
     np.testing.assert_allclose(action(model), ACTION, rtol=1e-6)
     model.learn(64)
     assert th.isfinite(model.policy.action_net.weight).all()
+
+
+def test_an_old_policy_loads_alone() -> None:
+    policy = MlpPolicy.load(OLD_POLICY, device="cpu")
+    np.testing.assert_allclose(action(policy), ACTION, rtol=1e-6)
+    assert policy.value_net.out_features == 3
 
 
 def test_old_names_are_known_only_to_the_file() -> None:
