@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from functools import partial
 from pathlib import Path
@@ -420,3 +421,16 @@ def test_a_subclass_keeps_its_own_arguments_and_counters(path: Path, weights_onl
     message = r"^The settings in a file must be arguments of GCRPPO, found \['label', 'temperature"
     with pytest.raises(ValueError, match=message):
         GCRPPO.load(path, env, device="cpu", weights_only=True)
+
+
+# === Pickle ===
+
+
+@pytest.mark.parametrize("method", ["auto", "passes"])
+def test_a_model_that_has_learned_can_be_pickled(method: str) -> None:
+    """As SB3's PPO can."""
+    model = GCRPPO("MlpPolicy", make_vec_env(Env, 2), gramian_method=method, **SMALL).learn(64)
+    copy = pickle.loads(pickle.dumps(model))
+    assert th.equal(parameters(copy), parameters(model))
+    copy.learn(64)
+    assert th.isfinite(parameters(copy)).all()
