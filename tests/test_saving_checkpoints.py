@@ -87,6 +87,15 @@ def train_until_killed(folder: Path) -> None:
     model.learn(10**9, callbacks, reset_num_timesteps=False)
 
 
+def time_of_saving(path: Path) -> float:
+    """Seconds for a file of the training above, on this machine at this moment."""
+    model = GCRPPO("MlpPolicy", normalized(), n_steps=8, batch_size=16, policy_kwargs=BIG)
+    model.learn(16)
+    start = time.perf_counter()
+    model.save(path)
+    return time.perf_counter() - start
+
+
 @pytest.mark.skipif(os.name != "posix", reason="needs fork")
 def test_a_training_killed_at_any_moment_goes_on(tmp_path: Path) -> None:
     context = multiprocessing.get_context(
@@ -94,6 +103,7 @@ def test_a_training_killed_at_any_moment_goes_on(tmp_path: Path) -> None:
     )  # imports once; its children start in milliseconds
     context.set_forkserver_preload(["torch._dynamo", "sb3_gcr", __name__])
     rng = np.random.default_rng()
+    pause = 8 * time_of_saving(tmp_path / "first.zip")
     steps, n_interrupted = 0, 0
     for _ in range(N_KILLS):
         process = context.Process(target=train_until_killed, args=(tmp_path,), daemon=True)
@@ -103,7 +113,7 @@ def test_a_training_killed_at_any_moment_goes_on(tmp_path: Path) -> None:
             time.sleep(0.002)
         while not (tmp_path / "last.zip").exists():  # the first training has made one
             time.sleep(0.002)
-        time.sleep(rng.uniform(0, 0.25))
+        time.sleep(rng.uniform(0, pause))
         process.kill()
         process.join()
         assert process.exitcode == -signal.SIGKILL

@@ -197,6 +197,17 @@ def former_settings(found: Collection[str], model_class: type[Any]) -> dict[str,
     return {name: value for name, value in FORMERLY.items() if name in missing}
 
 
+def missing_attributes(found: Collection[str], model_class: type[Any]) -> dict[str, Any]:
+    """What the file of a PPO, or an older one of ours, does not say of its model.
+
+    :param found: names of the attributes in the file
+    :param model_class: whose settings they are
+    """
+    if "reward_spec" not in found:
+        return {"reward_spec": SCALAR_REWARD}
+    return former_settings(found, model_class)
+
+
 def _read_tensors(name: str, content: bytes, device: th.device | str) -> Any:
     try:
         return th.load(io.BytesIO(content), map_location=get_device(device), weights_only=True)

@@ -14,20 +14,20 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_gcr.rewards.spec import SCALAR_REWARD, RewardSpec
+from sb3_gcr.rewards.spec import RewardSpec
 from sb3_gcr.saving.archive import (
     ModelPath,
     SavedModel,
     append_description,
     describe_model,
-    former_settings,
+    missing_attributes,
     read_attributes,
     read_description,
     read_pickled,
     read_plain,
 )
 from sb3_gcr.saving.checkpoints import saving_path, whole_file
-from sb3_gcr.saving.settings import attribute_of, find_settings, refuse_text
+from sb3_gcr.saving.settings import attribute_of, declared, find_settings, refuse_text
 from sb3_gcr.saving.spaces import check_spaces
 from sb3_gcr.saving.statistics import find_mismatch, restore_statistics
 from sb3_gcr.saving.warm_start import merge_parameters
@@ -93,12 +93,12 @@ class Saving(OnPolicyAlgorithm):
         include: Iterable[str] | None,
     ) -> None:
         super().save(file, exclude, include)
-        numbers = _declared(type(self), "saved_numbers")
+        numbers = declared(type(self), "saved_numbers")
         description = describe_model(self, self.reward_spec, numbers, self._waiting_statistics)
         append_description(file, description)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *_declared(type(self), "unsaved")]
+        return [*super()._excluded_save_params(), *declared(type(self), "unsaved")]
 
     @classmethod
     def load(
@@ -156,12 +156,12 @@ class Saving(OnPolicyAlgorithm):
             refuse_text(attributes, find_settings(cls), " in the file")
             follows = cls._begin_anew(given)
             changes = {attribute_of(name, attributes): value for name, value in kwargs.items()}
-            changes = {**_missing_attributes(attributes, cls), **follows, **changes}
+            changes = {**missing_attributes(attributes, cls), **follows, **changes}
             model = super().load(
                 path, env, device, attributes, print_system_info, force_reset, **changes
             )
             # Setting the model up has begun some of its numbers anew.
-            numbers = set(_declared(cls, "saved_numbers")) - changes.keys()
+            numbers = set(declared(cls, "saved_numbers")) - changes.keys()
             model.__dict__.update({name: attributes[name] for name in numbers & attributes.keys()})
         model._take_statistics(read_description(path))
         return model
@@ -182,7 +182,7 @@ class Saving(OnPolicyAlgorithm):
         settings = find_settings(cls).keys() | {"policy"}
         attributes = {name: given[name] for name in given.keys() - settings}
         given = {name: given[name] for name in given.keys() & settings}
-        saved = read_plain(path, device, cls, _declared(cls, "saved_numbers"), given)
+        saved = read_plain(path, device, cls, declared(cls, "saved_numbers"), given)
         model = cls._build(saved, env, device, given)
         model.reward_spec = saved.spec
         model._setup_model()
@@ -210,7 +210,7 @@ class Saving(OnPolicyAlgorithm):
     @classmethod
     def _begin_anew(cls, given: Mapping[str, Any]) -> dict[str, None]:
         """The attributes that follow an argument which the caller has given, without a value."""
-        followers = _declared(cls, "followers")
+        followers = declared(cls, "followers")
         return {attribute: None for attribute, argument in followers if argument in given}
 
     @classmethod
@@ -250,7 +250,7 @@ class Saving(OnPolicyAlgorithm):
         """
         given = cls._join_given(custom_objects, kwargs)
         if weights_only:
-            saved = read_plain(path, device, cls, _declared(cls, "saved_numbers"), given)
+            saved = read_plain(path, device, cls, declared(cls, "saved_numbers"), given)
         else:
             saved = read_pickled(path, device, cls, custom_objects)
         model = cls._build(saved, env, device, given)
@@ -314,13 +314,7 @@ class Saving(OnPolicyAlgorithm):
         if mismatch:
             warnings.warn(mismatch, stacklevel=3)
         self._waiting_statistics = saved if vec_normalize is None else None
-        if saved is None:
-            return "VecNormalize: no statistics in the file"
-        if vec_normalize is None:
-            return "VecNormalize: none, though the file has statistics"
-        if not restore_statistics(vec_normalize, saved, returns):
-            return "VecNormalize keeps its own statistics"
-        return f"VecNormalize's statistics of observations{' and returns' if returns else ''} kept"
+        return restore_statistics(vec_normalize, saved, returns)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         result = super()._setup_learn(*args, **kwargs)
@@ -328,16 +322,3 @@ class Saving(OnPolicyAlgorithm):
         if self.warm_start_report is not None:
             self.logger.info(self.warm_start_report)
         return result
-
-
-def _declared(model_class: type[Any], name: str) -> list[Any]:
-    """What a class and its bases list under a name, the bases first."""
-    bases = reversed(model_class.__mro__)
-    return [item for base in bases for item in vars(base).get(name, ())]
-
-
-def _missing_attributes(attributes: Mapping[str, Any], model_class: type[Saving]) -> dict[str, Any]:
-    """What the file of a PPO, or an older one of ours, does not say."""
-    if "reward_spec" not in attributes:
-        return {"reward_spec": SCALAR_REWARD}
-    return former_settings(attributes, model_class)

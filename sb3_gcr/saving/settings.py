@@ -85,6 +85,16 @@ def find_settings(model_class: type[Any]) -> dict[str, Any]:
     return found
 
 
+def declared(model_class: type[Any], name: str) -> list[Any]:
+    """What a class and its bases list in a class attribute, the bases first.
+
+    :param model_class: of a model
+    :param name: of the attribute
+    """
+    bases = reversed(model_class.__mro__)
+    return [item for base in bases for item in vars(base).get(name, ())]
+
+
 def _find_parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:
     """A constructor's parameters, with types as objects where their names exist at run time."""
     try:

@@ -9,8 +9,8 @@ import numpy as np
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
-#: What VecNormalize begins to count from, less than one observation.
-_NOTHING_SEEN = 1
+#: VecNormalize begins to count at less than this.
+ONE_OBSERVATION = 1
 
 
 def _of_observations(vec_normalize: VecNormalize) -> dict[str, RunningMeanStd]:
@@ -79,19 +79,23 @@ def find_mismatch(
 
 
 def restore_statistics(
-    vec_normalize: VecNormalize, saved: Mapping[str, Any], returns: bool = True
-) -> bool:
+    vec_normalize: VecNormalize | None, saved: Mapping[str, Any] | None, returns: bool = True
+) -> str:
     """Give saved statistics to a VecNormalize that has not seen anything yet; one that has keeps
     its own.
 
-    :param vec_normalize: the wrapper of a model's env
-    :param saved: of ``describe_statistics``
+    :param vec_normalize: the wrapper of a model's env, None where it has none
+    :param saved: of ``describe_statistics``, None where there are none
     :param returns: whether to restore those of the returns, too
-    :return: whether they were restored
+    :return: what was done, for the log
     :raises ValueError: if the saved statistics are of other observations
     """
-    if _count_seen(vec_normalize) >= _NOTHING_SEEN:
-        return False
+    if saved is None:
+        return "VecNormalize: no statistics in the file"
+    if vec_normalize is None:
+        return "VecNormalize: none, though the file has statistics"
+    if _count_seen(vec_normalize) >= ONE_OBSERVATION:
+        return "VecNormalize keeps its own statistics"
     observations = _of_observations(vec_normalize)
     if observations and saved["observations"] and set(observations) != set(saved["observations"]):
         raise ValueError(
@@ -103,7 +107,8 @@ def restore_statistics(
         _restore_moments(observations[key], saved["observations"][key])
     if returns:
         _restore_moments(vec_normalize.ret_rms, saved["returns"])
-    return True
+        return "VecNormalize's statistics of observations and returns kept"
+    return "VecNormalize's statistics of observations kept"
 
 
 def _restore_moments(moments: RunningMeanStd, saved: Mapping[str, Any]) -> None:
