@@ -9,7 +9,7 @@ SEED ?= 0
 RESOLVER ?= gcr
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test test-mjlab check format pytest bench doc build lower compare clean
+.PHONY: help install train test test-mjlab check format pytest bench doc build lower clean
 
 help:  ## list the commands
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -22,7 +22,7 @@ $(VENV)/installed: setup.cfg pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "sb3_gcr needs pip and venv for $(PYTHON), and they are missing. On Debian and Ubuntu: apt install python3-pip python3-venv"; exit 1; }
 	@echo "== making the environment in $(VENV) (a few minutes the first time)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plots,torchjd,envpool,tests,zoo,onnx]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plots,torchjd,envpool,tests,zoo,onnx,study]'
 	@touch $@
 
 train: install  ## train on Humanoid-v5; TIMESTEPS=, ENV=, SEED=, RESOLVER= can be given
@@ -74,9 +74,6 @@ doc: install  ## the documentation in docs/_build/html; warnings are errors, and
 	@$(BIN)/sphinx-build -n -W --keep-going -q -b html docs docs/_build/html
 	@echo "== blocks, links, keys"
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/test_docs.py
-
-compare: install  ## the table of the README: GCRPPO and PPO, several seeds
-	@$(BIN)/python examples/compare.py
 
 clean:  ## remove the environment and all caches
 	rm -rf $(VENV) .venv-lower .venv-mjlab build dist docs/_build *.egg-info .mypy_cache .pytest_cache .ruff_cache

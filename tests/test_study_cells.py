@@ -319,6 +319,70 @@ def test_a_cell_in_the_foreground_and_one_that_raises(
     assert error["error"] == "RuntimeError: the robot is gone"
 
 
+def test_run_names_failed_cells_and_finishes_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import yaml
+
+    content = {
+        "name": "two",
+        "methods": ["gcr"],
+        "seeds": 1,
+        "minutes": 1,
+        "settings": SMALL,
+        "tasks": {
+            name: {"env": f"tests.study_envs:{env}", "timesteps": 200, "components": TERMS}
+            for name, env in {"bad": "Raising", "good": "Walk"}.items()
+        },
+    }
+    path = tmp_path / "two.yml"
+    path.write_text(yaml.safe_dump(content))
+    bad, good = expand(Manifest.load(path))
+    out = tmp_path / "out"
+    assert main(["run", str(path), "--out", str(out), "--jobs", "2"]) == 1
+    message = capsys.readouterr().err
+    assert "FAILED bad, gcr, seed 0: exit code 1: RuntimeError: the robot is gone" in message
+    assert f"again: sb3-gcr-study cell {out}/study.yml {bad.id}\n" in message
+    assert (out / f"cells/{good.id}/result.json").exists()
+    assert main(["plan", str(out / "study.yml")]) == 0
+    assert "2 cells, 1 to run" in capsys.readouterr().out
+    more = {**content, "name": "more", "tasks": {"good": content["tasks"]["good"]}}  # type: ignore[index]
+    path.write_text(yaml.safe_dump(more))
+    arguments = ["run", str(path), "--out", str(tmp_path / "more"), "--reuse", str(out)]
+    assert main(arguments) == 0
+    assert "1 cells taken over." in capsys.readouterr().out
+
+
+def test_compare_answers_and_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("sb3_gcr.study.report")
+    settings = ["n_envs=4", "n_steps=50", "batch_size=50", "n_epochs=2", "net_arch=[8]"]
+    arguments = ["compare", "--env", "tests.study_envs:Walk", "--methods", "multi_head", "gcrppo"]
+    arguments += ["--components", "speed=task", "torque=regulariser", "--timesteps", "200"]
+    arguments += ["--settings", *settings, "--out", str(tmp_path), "--yes", "--jobs", "2"]
+    assert main([*arguments, "--seeds", "1"]) == 0
+    assert "| speed  | task" in capsys.readouterr().out
+    first = {path: path.stat().st_mtime_ns for path in tmp_path.glob("cells/*/result.json")}
+    assert len(first) == 2
+    assert main([*arguments, "--seeds", "2"]) == 0
+    assert "4 cells, 2 to run" in capsys.readouterr().out
+    assert len(list(tmp_path.glob("cells/*/result.json"))) == 4
+    assert all(path.stat().st_mtime_ns == moment for path, moment in first.items())
+    assert "</html>" in (tmp_path / "report.html").read_text()
+    assert main([*arguments, "--seeds", "1"]) == 2
+    assert "a study can grow, not shrink" in capsys.readouterr().err
+
+
+def test_regulariser_weight_multiplies_the_regularisers_alone() -> None:
+    import gymnasium as gym
+
+    rows = []
+    for weight in (1.0, 10.0):
+        env = gym.make("sb3_gcr/HumanoidRun-v0", regulariser_weight=weight)
+        env.reset(seed=0)
+        rows.append(env.step(np.full(17, 0.5, np.float32))[4]["reward_components"])
+    assert rows[1] == pytest.approx(rows[0] * [1, 1, 1, 1, 10, 10, 10])
+
+
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray")
 @pytest.mark.filterwarnings("ignore")
 def test_ray_gives_the_same_numbers(tmp_path: Path, results: Mapping[str, Any]) -> None:

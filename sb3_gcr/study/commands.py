@@ -242,7 +242,6 @@ def sbatch(options: argparse.Namespace) -> int:
 
 def compare(options: argparse.Namespace) -> int:
     """Probe, plan, run and answer; 1 where cells have failed."""
-    comparing.check_extras()
     manifest = comparing.make_manifest(
         options.env,
         options.methods,
@@ -256,6 +255,7 @@ def compare(options: argparse.Namespace) -> int:
     options.manifest = str(Path(options.out) / MANIFEST)
     first = expand(manifest)[0]
     say(shown(probe(first.canonical())))
+    comparing.check_extras()
     store = open_folder(manifest, Path(options.out))
     say("\n" + plan_of(manifest, store))
     if not options.yes and not confirmed(manifest, store):

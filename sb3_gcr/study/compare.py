@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
+from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS
 from sb3_gcr.study.costs import estimate
 from sb3_gcr.study.manifest import Manifest, expand
 from sb3_gcr.study.methods import named, with_heads
@@ -40,6 +41,10 @@ def make_manifest(
     :raises ValueError: for what is unknown
     """
     check_names(settings, "--settings")
+    if components is None and env in GYMNASIUM_ENVS:  # a cell says what it is made of
+        components = GYMNASIUM_ENVS[env]["components"]
+        rest = GYMNASIUM_ENVS[env].get("residual")
+        residual = residual or ({rest: "task"} if rest else None)
     task = {
         "env": env,
         "env_kwargs": dict(env_kwargs),
