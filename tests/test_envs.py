@@ -39,7 +39,13 @@ from sb3_gcr.envs.tasks.catalogue import TASKS, make_task  # noqa: E402
 from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS  # noqa: E402
 
 PLANAR = ["HalfCheetah", "Hopper", "Swimmer", "Walker2d"]
-ALL_OBJECTIVES = {"HumanoidMO": {"energy": 2, "gait": 1, "baseh": 3, "armsp": 2}}
+PLANAR_OBJECTIVES = {"energy": 2, "baseh": 3, "lean": 2, "knee": 3}
+ALL_OBJECTIVES = {
+    "HumanoidMO": {"energy": 2, "gait": 1, "baseh": 3, "armsp": 2},
+    "HopperMO": PLANAR_OBJECTIVES,
+    "Walker2dMO": PLANAR_OBJECTIVES,
+    "HalfCheetahMO": PLANAR_OBJECTIVES,
+}
 RUN = "sb3_gcr/HumanoidRun-v0"
 
 

@@ -17,6 +17,9 @@ TASKS: dict[str, tuple[str, int]] = {
     "Walker2d": ("sb3_gcr.envs.tasks.planar", 1000),
     "HalfCheetah": ("sb3_gcr.envs.tasks.planar", 1000),
     "Swimmer": ("sb3_gcr.envs.tasks.planar", 1000),
+    "HopperMO": ("sb3_gcr.envs.tasks.planar_mo", 1000),
+    "Walker2dMO": ("sb3_gcr.envs.tasks.planar_mo", 1000),
+    "HalfCheetahMO": ("sb3_gcr.envs.tasks.planar_mo", 1000),
 }
 
 

@@ -42,6 +42,8 @@ def reward_ctrl(actions: Array, weight: float) -> Array:
 class PlanarTask(Task):
     """A robot of Gymnasium that moves along x."""
 
+    #: Gymnasium's env, which names the terms.
+    env_id: ClassVar[str]
     #: Model file, physics steps per control step, and weight of the control cost.
     name: ClassVar[str]
     n_substeps: int
@@ -52,9 +54,8 @@ class PlanarTask(Task):
     n_hidden: ClassVar[int] = 1
 
     def __init__(self) -> None:
-        env_id = f"{type(self).__name__}-v5"
         self.model = mujoco.MjModel.from_xml_path(str(ASSETS / self.name))
-        self.reward_spec = RewardSpec.from_dict(GYMNASIUM_ENVS[env_id]["components"])
+        self.reward_spec = RewardSpec.from_dict(GYMNASIUM_ENVS[self.env_id]["components"])
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         self.action_space = spaces.Box(low, high, dtype=np.float32)
         self.observation_space = unbounded(
@@ -93,6 +94,7 @@ class PlanarTask(Task):
 class HalfCheetah(PlanarTask):
     """HalfCheetah-v5: run, with small actions."""
 
+    env_id = "HalfCheetah-v5"
     name, n_substeps, ctrl_cost_weight, noise = "half_cheetah.xml", 5, 0.1, 0.1
 
     def start(self, rng: np.random.Generator) -> dict[str, ArrayLike]:
@@ -106,6 +108,7 @@ class HalfCheetah(PlanarTask):
 class Swimmer(PlanarTask):
     """Swimmer-v5: swim, with small actions."""
 
+    env_id = "Swimmer-v5"
     name, n_substeps, ctrl_cost_weight, noise, n_hidden = "swimmer.xml", 4, 1e-4, 0.1, 2
 
 
@@ -142,12 +145,14 @@ class LeggedTask(PlanarTask):
 class Walker2d(LeggedTask):
     """Walker2d-v5: walk without falling, with small actions."""
 
+    env_id = "Walker2d-v5"
     name, z_range, angle_range = "walker2d_v5.xml", (0.8, 2.0), (-1.0, 1.0)
 
 
 class Hopper(LeggedTask):
     """Hopper-v5: hop without falling, with small actions."""
 
+    env_id = "Hopper-v5"
     name, z_range, angle_range = "hopper.xml", (0.7, np.inf), (-0.2, 0.2)
 
     def _is_healthy(self, s: Rows) -> NDArray[np.bool_]:
