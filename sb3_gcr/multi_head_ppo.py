@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -22,8 +23,18 @@ from sb3_gcr.advantages import bootstrap_truncations
 from sb3_gcr.buffers import VectorDictRolloutBuffer, VectorRolloutBuffer
 from sb3_gcr.logs.shown import component_table
 from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiHeadActorCriticPolicy, MultiInputPolicy
-from sb3_gcr.rewards.reading import ComponentReader, find_reward_spec, match_specs, undecomposed_id
+from sb3_gcr.rewards.layers import outermost_attribute
+from sb3_gcr.rewards.reading import (
+    ComponentReader,
+    find_reward_spec,
+    match_specs,
+    refuse_vector_rewards,
+    undecomposed_id,
+)
+from sb3_gcr.rewards.returns import find_ended, is_monitored, zero_on_reset
 from sb3_gcr.rewards.spec import SCALAR_REWARD, RewardSpec
+
+T = TypeVar("T")
 
 
 class MultiHeadPPO(PPO):
@@ -57,6 +68,8 @@ class MultiHeadPPO(PPO):
         self._episode_components: NDArray[np.float64] | None = None
         #: Which components have ever paid, 1 or 0 each, in the order of ``reward_spec``.
         self._has_paid: list[int] = []
+        self._ended_returns: dict[int, float] = {}
+        self._reader: ComponentReader | None = None
         super().__init__(*args, **kwargs)
 
     @property
@@ -89,6 +102,8 @@ class MultiHeadPPO(PPO):
         with.
         """
         found = None if self.env is None else find_reward_spec(self.env)
+        if self.env is not None and found is None:
+            refuse_vector_rewards(self.env)
         if "reward_spec" in self.__dict__:
             self.reward_spec = match_specs(self.reward_spec, found)
             return
@@ -169,7 +184,9 @@ class MultiHeadPPO(PPO):
         result = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        self._reader = ComponentReader(self.env, self.reward_spec)
+        if self._reader is None or not self._reader.is_for(self.env, self.reward_spec):
+            self._reader = ComponentReader(self.env, self.reward_spec)
+        self._is_monitored = is_monitored(self.env)
         if self.n_components > 1:
             self.logger.info(f"{self.n_components} reward components: {self.reward_spec}")
         else:
@@ -201,7 +218,7 @@ class MultiHeadPPO(PPO):
         rollout_buffer.reset()
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
-        callback.on_rollout_start()
+        self._listen(callback.on_rollout_start)
         has_paid = self.has_paid
         n_steps = 0
         while n_steps < n_rollout_steps:
@@ -215,10 +232,10 @@ class MultiHeadPPO(PPO):
             new_obs, rewards, dones, infos = env.step(clipped_actions)
             self.num_timesteps += env.num_envs
             reward_components, original_components = self._read_components(rewards, infos)
-            self._count_components(original_components, dones)
+            self._count_components(original_components, dones, infos)
             has_paid |= (original_components != 0).any(0)
             callback.update_locals(locals())
-            if not callback.on_step():
+            if not self._listen(callback.on_step):
                 return False
             self._update_info_buffer(infos, dones)
             n_steps += 1
@@ -240,7 +257,7 @@ class MultiHeadPPO(PPO):
         # The untrained head of a component that has never paid says nothing of an action.
         rollout_buffer.advantages[..., ~self.has_paid] = 0.0
         callback.update_locals(locals())
-        callback.on_rollout_end()
+        self._listen(callback.on_rollout_end)
         return True
 
     @property
@@ -266,14 +283,37 @@ class MultiHeadPPO(PPO):
     ) -> tuple[NDArray[Any], NDArray[Any]]:
         if self.n_components == 1:  # a VecEnv may then return no infos at all
             return rewards[:, None], rewards[:, None]
+        assert self._reader is not None
         return self._reader.read(rewards, infos, self.num_timesteps)
 
-    def _count_components(self, components: NDArray[Any], dones: NDArray[np.bool_]) -> None:
+    def _count_components(
+        self, components: NDArray[Any], dones: NDArray[np.bool_], infos: Any
+    ) -> None:
         """Keep the return of each component per episode, in the units of the env."""
         assert self._episode_components is not None
         self._episode_components += components
-        self.ep_component_buffer.extend(self._episode_components[dones])
-        self._episode_components[dones] = 0.0
+        ended = find_ended(dones, infos, self._is_monitored)
+        returns = self._episode_components[ended]
+        self.ep_component_buffer.extend(returns)
+        self._ended_returns = dict(zip(ended.tolist(), returns.sum(1).tolist(), strict=True))
+        self._episode_components[ended] = 0.0
+
+    def _update_info_buffer(self, infos: Any, dones: NDArray[np.bool_] | None = None) -> None:
+        """SB3's, but the return of an episode is the sum of its components."""
+        if self.n_components > 1:
+            infos = list(infos)
+            for index, total in self._ended_returns.items():
+                if index < len(infos) and "episode" in infos[index]:
+                    episode = {**infos[index]["episode"], "r": total}
+                    infos[index] = {**infos[index], "episode": episode}
+        super()._update_info_buffer(infos, dones)
+
+    def _listen(self, call: Callable[[], T]) -> T:
+        """Call a callback, which may reset envs: their episodes then begin anew."""
+        assert self.env is not None
+        assert self._episode_components is not None
+        with zero_on_reset(self.env, self._episode_components):
+            return call()
 
     def _bootstrap(
         self, components: NDArray[Any], dones: NDArray[np.bool_], infos: Any
@@ -308,7 +348,8 @@ class MultiHeadPPO(PPO):
 
         :param iteration: current logging iteration
         """
-        n_diverged = getattr(self.env, "n_diverged", None)  # our batched envs count them
+        assert self.env is not None
+        n_diverged = outermost_attribute(self.env, "n_diverged")  # our batched envs count them
         if n_diverged is not None:
             self.logger.record("rollout/n_diverged", n_diverged)
         if self.n_components == 1:

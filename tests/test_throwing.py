@@ -4,10 +4,14 @@ observation.
 
 from __future__ import annotations
 
+import csv
+from pathlib import Path
+
 import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 pytest.importorskip("mujoco.batch")
 
@@ -187,9 +191,11 @@ def test_wrong_range_is_refused() -> None:
         throwing.ThrowingMO(rgtarm=5)
 
 
-@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, BatchedVecEnv])
-def test_curriculum_moves_the_target_away(vec_env_cls: type[VecEnv]) -> None:
-    env = make_vec_env("sb3_gcr/ThrowingMO-v0", 2, vec_env_cls=vec_env_cls)  # type: ignore[arg-type]
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv, BatchedVecEnv])
+def test_curriculum_moves_the_target_away(vec_env_cls: type[VecEnv], tmp_path: Path) -> None:
+    """The envs are where the log says, in other processes too."""
+    env_id = "sb3_gcr:sb3_gcr/ThrowingMO-v0"  # a worker imports the package by itself
+    env = make_vec_env(env_id, 2, vec_env_cls=vec_env_cls)  # type: ignore[arg-type]
     never, always = (
         DistanceCurriculum(throwing=5),
         DistanceCurriculum(0.3, 1.5, throwing=-9, stability=-9),
@@ -199,8 +205,14 @@ def test_curriculum_moves_the_target_away(vec_env_cls: type[VecEnv]) -> None:
     )
     model.learn(202, callback=never)
     assert {task.max_distance for task in env.get_attr("task")} == {1}
+    model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(3 * 202, callback=always)
+    model.logger.close()
     assert {task.max_distance for task in env.get_attr("task")} == {1.5}
+    with (tmp_path / "progress.csv").open() as file:
+        logged = [row["curriculum/max_distance"] for row in csv.DictReader(file)]
+    assert logged[-1] == "1.5"
+    env.close()
 
 
 def test_curriculum_refuses_what_it_cannot_do() -> None:

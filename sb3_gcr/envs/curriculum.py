@@ -7,6 +7,8 @@ from collections import deque
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_gcr.rewards.layers import env_attributes
+
 
 class DistanceCurriculum(BaseCallback):
     """Raises ThrowingMO's ``max_distance`` after each rollout, once the robot throws and stands.
@@ -40,8 +42,9 @@ class DistanceCurriculum(BaseCallback):
         self._returns: deque[tuple[float, float]] = deque(maxlen=100)
 
     def _on_training_start(self) -> None:
-        tasks = self.training_env.get_attr("task") if self.training_env.has_attr("task") else [None]
-        if not hasattr(tasks[0], "max_distance"):
+        tasks = env_attributes(self.training_env, "task")
+        can_move = env_attributes(self.training_env, "set_task")
+        if not tasks or not hasattr(tasks[0], "max_distance") or not can_move:
             raise ValueError(
                 "DistanceCurriculum needs the env 'sb3_gcr/ThrowingMO-v0', found one without "
                 "targets."
@@ -54,11 +57,17 @@ class DistanceCurriculum(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        tasks = self.training_env.get_attr("task")
+        max_distance = self._max_distance()
         if self._returns and not self.has_started:
             self.has_started = bool((np.mean(self._returns, axis=0) > self.thresholds).all())
         if self.has_started:
-            distance = min(self.limit, tasks[0].max_distance + self.increment)
-            for task in tasks:
-                task.max_distance = distance
-        self.logger.record("curriculum/max_distance", tasks[0].max_distance)
+            distance = min(self.limit, max_distance + self.increment)
+            # `get_attr` gives copies where the envs are in other processes.
+            self.training_env.env_method("set_task", max_distance=distance)
+            max_distance = self._max_distance()
+        self.logger.record("curriculum/max_distance", max_distance)
+
+    def _max_distance(self) -> float:
+        """That of the first env, as it is there."""
+        distance: float = self.training_env.get_attr("task", indices=[0])[0].max_distance
+        return distance

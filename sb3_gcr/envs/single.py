@@ -101,6 +101,14 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]], gym.utils.EzPickle):
             self.render()
         return step.observations[0], float(components.sum()), bool(step.terminated[0]), False, info
 
+    def set_task(self, **values: Any) -> None:
+        """Set attributes of the task; ``VecEnv.env_method("set_task", ...)`` reaches workers, too.
+
+        :param values: by name
+        """
+        for name, value in values.items():
+            setattr(self.task, name, value)
+
     def render(self) -> Any:
         """A picture (height, width, 3) in mode "rgb_array"; a window in mode "human"."""
         return self._painter.paint(self.render_mode) if self.render_mode else None

@@ -62,6 +62,7 @@ class RewardSpec:
                 f"Parameter `names` must be unique, found {duplicates} more than once in "
                 f"{list(names)}."
             )
+        _refuse_folders(names)
         if len(self.levels) != len(names):
             raise ValueError(
                 f"Parameter `levels` must have one level for each of the {len(names)} names, found "
@@ -109,6 +110,17 @@ class RewardSpec:
 
     def __str__(self) -> str:
         return ", ".join(f"{name} ({level_label(level)})" for name, level in self)
+
+
+def _refuse_folders(names: tuple[str, ...]) -> None:
+    """Refuse a name that is the folder of another: loggers make a file or a folder of each key."""
+    for folder in names:
+        for name in names:
+            if name.startswith(f"{folder}/"):
+                raise ValueError(
+                    f"Parameter `names` must not contain a name that is the folder of another: "
+                    f"found {folder!r} and {name!r}, which loggers cannot both write. Rename one."
+                )
 
 
 def parse_level(level: Any, name: str) -> int:

@@ -138,6 +138,7 @@ class EnvPoolVecEnv(VecEnv):
                 f"Parameter `residual` must be a name or {{name: level}}, found {residual!r}."
             )
         self.reward_spec = RewardSpec((*levels, *rest), (*levels.values(), *rest.values()))  # type: ignore[arg-type]
+        self.reward_residual = next(iter(rest), None)
         self.reward_components = np.zeros((num_envs, len(self.reward_spec)))
         self._episode_returns = self.reward_components.copy()
         self.render_mode = None  # asked for by VecEnv.__init__
