@@ -3,10 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 from torch.optim import optimizer
+
+
+class KernelArguments(NamedTuple):
+    """What the fused kernel takes, and where it was found; one entry for each parameter."""
+
+    parameters: list[th.Tensor]
+    averages: list[th.Tensor]
+    """First moments, ``exp_avg`` of the states."""
+    squares: list[th.Tensor]
+    """Second moments, ``exp_avg_sq`` of the states."""
+    steps: list[th.Tensor]
+    """Numbers of steps, ``step`` of the states; elements of ``all_steps``."""
+    all_steps: th.Tensor
+    """The same as one vector, to count all of them at once."""
+    in_group: list[int]
+    """Ids of the group's parameters, in its order."""
 
 
 class FusedAdam(th.optim.Adam):
@@ -15,16 +31,15 @@ class FusedAdam(th.optim.Adam):
 
     For small networks PyTorch's step spends most of its time looking up every parameter's state and
     recording itself for the profiler. Whatever is unusual (closures, hooks, several parameter
-    groups, AMSGrad, parameters without gradient, a changed state) takes PyTorch's own step.
+    groups, AMSGrad, parameters without gradient, a state that is not the one of the last step)
+    takes PyTorch's own step.
 
     :param params: as for ``torch.optim.Adam``
     :param kwargs: as for ``torch.optim.Adam``
     """
 
-    #: Parameters and their states, in the order of the kernel's arguments; not saved.
-    _arguments: tuple[list[th.Tensor], ...] | None = None
-    #: The steps of all parameters as one vector; the states hold its elements.
-    _steps: th.Tensor
+    #: As of the last of PyTorch's own steps; not saved.
+    _arguments: KernelArguments | None = None
 
     def __init__(self, params: Any, **kwargs: Any):
         super().__init__(params, **{**kwargs, "fused": True})
@@ -34,43 +49,25 @@ class FusedAdam(th.optim.Adam):
         super().load_state_dict(state_dict)
         for group in self.param_groups:
             group["fused"], group["foreach"] = True, None
-        self._arguments = None
-
-    def add_param_group(self, param_group: dict[str, Any]) -> None:
-        """Add a group of parameters."""
-        super().add_param_group(param_group)
-        self._arguments = None
 
     @th.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """One step of Adam."""
-        gradients = (
-            [p.grad for p in self._arguments[0] if p.grad is not None]
-            if self._arguments is not None
-            else []
-        )
-        if (
-            closure is not None
-            or self._has_hooks()
-            or self._arguments is None
-            or len(gradients) < len(self._arguments[0])
-        ):
-            step = th.optim.Adam.step
-            loss = (step if hasattr(step, "hooked") else self.profile_hook_step(step))(
-                self, closure
-            )
-            self._arguments = self._collect()
-            return loss
-        parameters, averages, squares, steps = self._arguments
+        arguments = self._arguments
+        if arguments is None or closure is not None or not self._are_current(arguments):
+            return self._step_of_pytorch(closure)
+        gradients = [parameter.grad for parameter in arguments.parameters]
+        if any(gradient is None for gradient in gradients):
+            return self._step_of_pytorch(closure)
         group = self.param_groups[0]
-        self._steps.add_(1)
+        arguments.all_steps.add_(1)
         th._fused_adam_(
-            parameters,
+            arguments.parameters,
             gradients,
-            averages,
-            squares,
+            arguments.averages,
+            arguments.squares,
             [],
-            steps,
+            arguments.steps,
             lr=group["lr"],
             beta1=group["betas"][0],
             beta2=group["betas"][1],
@@ -84,36 +81,79 @@ class FusedAdam(th.optim.Adam):
     # else PyTorch wraps it in a record that costs as much as the kernel
     step.hooked = True  # type: ignore[attr-defined]
 
-    def _has_hooks(self) -> bool:
+    def _step_of_pytorch(self, closure: Callable[[], Any] | None) -> Any:
+        step = th.optim.Adam.step
+        if not hasattr(step, "hooked"):
+            step = self.profile_hook_step(step)
+        loss = step(self, closure)
+        self._arguments = self._collect()
+        return loss
+
+    def _are_current(self, arguments: KernelArguments) -> bool:
+        """Whether the arguments are still what PyTorch's own step would look up."""
+        if (
+            self._is_unusual()
+            or list(map(id, self.param_groups[0]["params"])) != arguments.in_group
+        ):
+            return False
+        if len(self.state) != len(arguments.parameters):
+            return False
+        # In the order of the state: a look-up costs more than a comparison.
+        for found, parameter, average, squares, step in zip(
+            self.state.items(),
+            arguments.parameters,
+            arguments.averages,
+            arguments.squares,
+            arguments.steps,
+            strict=True,
+        ):
+            owner, state = found
+            if (
+                owner is not parameter
+                or state.get("exp_avg") is not average
+                or state.get("exp_avg_sq") is not squares
+                or state.get("step") is not step
+            ):
+                return False
+        return True
+
+    def _is_unusual(self) -> bool:
+        """Whether a step has more to do than the kernel for one group of parameters."""
+        group = self.param_groups[0]
         return bool(
-            self._optimizer_step_pre_hooks
+            len(self.param_groups) > 1
+            or group["amsgrad"]
+            or group["capturable"]
+            or group["differentiable"]
+            or not group["fused"]
+            or group.get("decoupled_weight_decay")
+            or isinstance(group["lr"], th.Tensor)
+            or self._optimizer_step_pre_hooks
             or self._optimizer_step_post_hooks
             or optimizer._global_optimizer_pre_hooks
             or optimizer._global_optimizer_post_hooks
         )
 
-    def _collect(self) -> tuple[list[th.Tensor], ...] | None:
+    def _collect(self) -> KernelArguments | None:
         """The kernel's arguments, if every parameter has a state and nothing is unusual."""
-        group = self.param_groups[0]
-        unusual = (
-            len(self.param_groups) > 1
-            or group["amsgrad"]
-            or group["capturable"]
-            or isinstance(group["lr"], th.Tensor)
-        )
-        parameters = group["params"]
-        states = [
-            state for state in (self.state.get(parameter) for parameter in parameters) if state
-        ]
+        in_group = list(map(id, self.param_groups[0]["params"]))
+        parameters = list(self.state)
+        states = list(self.state.values())
         if (
-            unusual
-            or len(states) < len(parameters)
+            self._is_unusual()
+            or {id(parameter) for parameter in parameters} != {*in_group}
+            or not all(states)
             or len({parameter.device for parameter in parameters}) > 1
         ):
             return None
-        self._steps = th.stack([state["step"] for state in states])
-        for state, step in zip(states, self._steps.unbind(), strict=True):
+        all_steps = th.stack([state["step"] for state in states])
+        for state, step in zip(states, all_steps.unbind(), strict=True):
             state["step"] = step
-        return parameters, *(
-            [state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step")
+        return KernelArguments(
+            parameters,
+            [state["exp_avg"] for state in states],
+            [state["exp_avg_sq"] for state in states],
+            [state["step"] for state in states],
+            all_steps,
+            in_group,
         )

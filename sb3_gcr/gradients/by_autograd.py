@@ -14,6 +14,7 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_gcr.gradients.hooks import BackwardHooks
 from sb3_gcr.gradients.memory import Weights
 
 
@@ -29,15 +30,18 @@ def gramian_by_passes(
     :param parameters: θ and others; log π need not depend on all of them
     :return: G, shape (K, K)
     """
-    n_components = cotangents.shape[1]
     if not log_prob.requires_grad:  # a frozen actor
-        return cotangents.new_zeros(n_components, n_components)
+        parameters = []
+    no_gradient = cotangents.new_zeros(0)
     rows = []
     for cotangent in cotangents.unbind(1):
-        gradients = th.autograd.grad(
-            log_prob, parameters, cotangent, retain_graph=True, allow_unused=True
-        )
-        rows.append(th.cat([g.flatten() for g in gradients if g is not None]))
+        gradients: Sequence[th.Tensor | None] = ()
+        if parameters:
+            gradients = th.autograd.grad(
+                log_prob, parameters, cotangent, retain_graph=True, allow_unused=True
+            )
+        parts = [gradient.flatten() for gradient in gradients if gradient is not None]
+        rows.append(th.cat([no_gradient, *parts]))
     jacobian = th.stack(rows)
     return jacobian @ jacobian.T
 
@@ -55,6 +59,7 @@ class ByAutograd:
     def __init__(self, policy: ActorCriticPolicy):
         self.policy = policy
         self._parameters = [p for p in policy.parameters() if p.requires_grad]
+        self._hooks = BackwardHooks(policy)
 
     def session(self) -> AbstractContextManager[object]:
         """Threads are PyTorch's own business here."""
@@ -66,7 +71,7 @@ class ByAutograd:
 
     def evaluate(self, observations: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Values V, shape (B, K), and log π(a|s), shape (B,)."""
-        with th.enable_grad():
+        with th.enable_grad(), self._hooks.can_be_silenced():
             evaluated = self.policy.evaluate_actions(observations, actions)  # type: ignore[arg-type]
             self._values, self._log_prob, entropy = evaluated
             self._entropy_loss = self._log_prob.mean() if entropy is None else -entropy.mean()
@@ -85,7 +90,8 @@ class ByAutograd:
         if n_samples is not None:
             cotangents = cotangents.clone()
             cotangents[n_samples:] = 0
-        return gramian_by_passes(self._log_prob, cotangents, self._parameters)
+        with self._hooks.silent():
+            return gramian_by_passes(self._log_prob, cotangents, self._parameters)
 
     def backward(
         self,
@@ -101,7 +107,9 @@ class ByAutograd:
         :param value_gradients: of the loss by the values, shape (B, K)
         :param ent_coef: weight of the entropy loss
         """
-        self.policy.zero_grad()  # of frozen parameters, too: an optimiser steps whatever has one
+        # Of frozen and forgotten parameters, too: an optimiser steps whatever has a gradient.
+        self.policy.zero_grad()
+        self.policy.optimizer.zero_grad()
         w = th.as_tensor(weights, dtype=cotangents.dtype, device=cotangents.device)
         outputs = [self._log_prob, self._values]
         gradients = [cotangents @ w, value_gradients]

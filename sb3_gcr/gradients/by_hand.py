@@ -44,7 +44,12 @@ class ByHand:
         # Vectors pass through SB3's preprocessing and flattening as they are.
         space = policy.observation_space
         is_vector = isinstance(space, spaces.Box) and len(space.shape) == 1
-        self._takes_vectors = is_vector and type(policy.pi_features_extractor) is FlattenExtractor
+        self._extractor = (
+            policy.features_extractor
+            if policy.share_features_extractor
+            else policy.pi_features_extractor
+        )
+        self._takes_vectors = is_vector and type(self._extractor) is FlattenExtractor
 
     def session(self) -> AbstractContextManager[object]:
         """NumPy's BLAS has one thread during an update in NumPy."""
@@ -63,8 +68,7 @@ class ByHand:
     def _features(self, observations: PyTorchObs) -> th.Tensor:
         if self._takes_vectors and isinstance(observations, th.Tensor):
             return observations.float()
-        extractor = self.policy.pi_features_extractor
-        return BasePolicy.extract_features(self.policy, observations, extractor)
+        return BasePolicy.extract_features(self.policy, observations, self._extractor)
 
     def entropy_loss(self) -> Array:
         """Minus the mean entropy."""

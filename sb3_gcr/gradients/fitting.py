@@ -20,6 +20,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, MlpExtractor
 from torch import nn
 
+from sb3_gcr.gradients.hooks import is_hooked
 from sb3_gcr.gradients.layers import ACTIVATIONS
 
 #: Distributions with a head in :mod:`sb3_gcr.gradients.heads`.
@@ -36,8 +37,6 @@ REPLACED = (
     "_get_action_dist_from_latent",
     "_build_mlp_extractor",
 )
-#: Where PyTorch keeps the hooks of a module.
-MODULE_HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 
 
 def fits(policy: ActorCriticPolicy) -> bool:
@@ -45,13 +44,13 @@ def fits(policy: ActorCriticPolicy) -> bool:
 
     :param policy: as it is now
     """
-    if not _runs_sb3s_code(policy):
-        return False
-    if not (fits_mlp(actor_modules(policy)) and fits_mlp(critic_modules(policy))):
-        return False
-    if any(getattr(module, hooks) for module in policy.modules() for hooks in MODULE_HOOKS):
-        return False
-    return _owns_each_parameter_once(policy)
+    return (
+        _runs_sb3s_code(policy)
+        and fits_mlp(actor_modules(policy))
+        and fits_mlp(critic_modules(policy))
+        and not is_hooked(policy)
+        and _trains_each_parameter_once(policy)
+    )
 
 
 def actor_modules(policy: ActorCriticPolicy) -> list[nn.Module]:
@@ -81,16 +80,24 @@ def _runs_sb3s_code(policy: ActorCriticPolicy) -> bool:
         getattr(type(policy), name) is not getattr(ActorCriticPolicy, name) for name in REPLACED
     ):
         return False
-    extractors = (policy.pi_features_extractor, policy.vf_features_extractor)
-    if not all(_only_flattens(extractor) for extractor in extractors):
+    if not all(_only_flattens(extractor) for extractor in _extractors(policy)):
         return False
-    if (
-        type(policy.action_dist) not in DISTRIBUTIONS
-        or type(policy.mlp_extractor) is not MlpExtractor
-    ):
+    if type(policy.action_dist) not in DISTRIBUTIONS:
+        return False
+    hidden = policy.mlp_extractor
+    if type(hidden) is not MlpExtractor:
+        return False
+    if not all(type(net) is nn.Sequential for net in (hidden.policy_net, hidden.value_net)):
         return False
     parts: Iterable[object] = (*policy.modules(), policy.action_dist)
     return not any(_hides_a_method(part) for part in parts)
+
+
+def _extractors(policy: ActorCriticPolicy) -> list[nn.Module]:
+    """The features extractors that run, of the actor and of the critic."""
+    if policy.share_features_extractor:
+        return [policy.features_extractor]
+    return [policy.pi_features_extractor, policy.vf_features_extractor]
 
 
 def _only_flattens(extractor: nn.Module) -> bool:
@@ -108,20 +115,27 @@ def _hides_a_method(part: object) -> bool:
     )
 
 
-def _owns_each_parameter_once(policy: ActorCriticPolicy) -> bool:
-    """Whether each parameter is trained, by one layer, and nobody watches its gradient."""
+def _trains_each_parameter_once(policy: ActorCriticPolicy) -> bool:
+    """Whether each parameter belongs to one layer and is trained, and the optimiser has no more."""
     expected: list[object] = []
     for layer in (*actor_modules(policy)[::2], *critic_modules(policy)[::2]):
         expected += [layer.weight, layer.bias]
     if isinstance(policy.action_dist, DiagGaussianDistribution):
+        if tuple(policy.log_std.shape) != policy.action_space.shape:
+            return False
         expected.append(policy.log_std)
     found = list(policy.parameters())
-    if len(found) != len(expected) or {id(p) for p in found} != {id(p) for p in expected}:
+    known = {id(parameter) for parameter in expected}
+    if len(found) != len(expected) or {id(parameter) for parameter in found} != known:
         return False
-    return all(_is_plain(parameter) for parameter in found)
+    if len({parameter.device for parameter in found}) > 1:
+        return False
+    groups = policy.optimizer.param_groups
+    stepped = {id(parameter) for group in groups for parameter in group["params"]}
+    return stepped <= known and all(_is_common(parameter) for parameter in found)
 
 
-def _is_plain(parameter: nn.Parameter) -> bool:
-    hooks = (parameter._backward_hooks, getattr(parameter, "_post_accumulate_grad_hooks", None))
+def _is_common(parameter: nn.Parameter) -> bool:
+    """Whether a parameter is a trained one of PyTorch's own kind."""
     is_float = parameter.dtype == th.float32 and parameter.is_contiguous()
-    return parameter.requires_grad and is_float and not any(hooks)
+    return type(parameter) is nn.Parameter and parameter.requires_grad and is_float
