@@ -10,6 +10,7 @@ from sb3_gcr.study.collected import Collected
 from sb3_gcr.study.contrasts import Contrast, corrected, over_configurations
 from sb3_gcr.study.frames import Frames
 from sb3_gcr.study.hypotheses import Judged, judged
+from sb3_gcr.study.registration import registration
 from sb3_gcr.study.statistics import normalised_score
 from sb3_gcr.study.tables import (
     FINAL,
@@ -64,12 +65,11 @@ class Scores(NamedTuple):
     left_out: tuple[str, ...]
 
 
-def conclude(study: Collected, data: Frames, registered: str = "") -> Conclusions:
+def conclude(study: Collected, data: Frames) -> Conclusions:
     """Everything that the finished cells allow to say.
 
     :param study: the folder
     :param data: its frames
-    :param registered: when the hypotheses were committed, in a sentence
     """
     methods = methods_of(study, data.cells)
     who = roles(methods)
@@ -104,7 +104,7 @@ def conclude(study: Collected, data: Frames, registered: str = "") -> Conclusion
         tuple(sentences),
         tuple(dict.fromkeys(warnings)),
         tuple(hypotheses),
-        registered,
+        registration(study),
     )
 
 

@@ -13,7 +13,6 @@ from sb3_gcr.study.conclusions import Conclusions, conclude
 from sb3_gcr.study.drawing import to_png
 from sb3_gcr.study.frames import Frames, frames
 from sb3_gcr.study.page import FOLDER, Block, Heading, Pictures, Text, to_html, to_markdown
-from sb3_gcr.study.registration import registration
 
 PAGE, MARKDOWN = "report.html", "report.md"
 
@@ -27,7 +26,7 @@ def answer(folder: str | Path) -> str:
     """
     study = collected(folder)
     data = frames(study.results, study.manifest.get("tasks") or [])
-    found = conclude(study, data, registration(Path(folder), study))
+    found = conclude(study, data)
     warnings = [f"Warning: {one}" for one in found.warnings]
     return "\n".join([*found.sentences, *warnings])
 
@@ -43,7 +42,7 @@ def write(folder: str | Path) -> Path:
     folder = Path(folder)
     study = collected(folder)
     data = frames(study.results, study.manifest.get("tasks") or [])
-    found = conclude(study, data, registration(folder, study))
+    found = conclude(study, data)
     parts = blocks(study, data, found, f"sb3-gcr-study cell {folder / 'study.yml'}")
     page = folder / PAGE
     page.write_text(to_html(study.name, parts), encoding="utf-8")
