@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import datetime, timezone
 
 from sb3_gcr.study.collected import Collected
 
-FORMAT = "%Y-%m-%d %H:%M %z"
+FORMAT = "%Y-%m-%d %H:%M UTC"
 
 
 def registration(study: Collected) -> str:
@@ -20,7 +20,7 @@ def registration(study: Collected) -> str:
     registered = study.manifest.get("registered")
     if not registered:
         return "The hypotheses are in no commit: nothing shows that they came before the cells."
-    committed = datetime.fromisoformat(str(registered["date"]))
+    committed = moment(str(registered["date"]))
     lead = f"The hypotheses were committed in {str(registered['commit'])[:10]} on "
     lead += f"{committed.strftime(FORMAT)}"
     if registered.get("changed"):
@@ -35,7 +35,14 @@ def registration(study: Collected) -> str:
 
 
 def first_start(study: Collected) -> datetime | None:
-    """When the first cell began, in its own time zone or this machine's; None if unknown."""
+    """When the first cell began; None where no cell says."""
     times = [(one.get("provenance") or {}).get("started") for one in study.results]
-    found = [datetime.fromisoformat(str(time)) for time in times if time]
-    return min((time.astimezone() for time in found), default=None)
+    return min((moment(str(time)) for time in times if time), default=None)
+
+
+def moment(text: str) -> datetime:
+    """A time as git and the cells write it, in UTC.
+
+    :param text: ISO 8601 with a time zone; Python 3.10 does not know its letter Z
+    """
+    return datetime.fromisoformat(text.replace("Z", "+00:00")).astimezone(timezone.utc)
