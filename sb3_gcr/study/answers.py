@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple
 
+import numpy as np
+
 from sb3_gcr.study.contrasts import MARGIN, Contrast
 from sb3_gcr.study.hypotheses import Judged
 
@@ -14,6 +16,8 @@ from sb3_gcr.study.hypotheses import Judged
 ALPHA = 0.05
 #: More seeds than this are not counted.
 MANY_SEEDS = 1_000
+#: Per cent below this are the rounding of sums.
+ROUNDING = 1e-9
 #: Methods as people call them; others go by their own name.
 NAMES = {"ppo": "PPO", "gcr": "GCRPPO", "gcrppo": "GCRPPO"}
 METRICS = {"return_training": "return over training", "return_final": "final return"}
@@ -89,14 +93,16 @@ def opening(
     interim = n_cells is not None and ended < n_cells
     head = f"Interim, {ended} of {n_cells} runs: " if interim else ""
     return (
-        f"{head}{env}, {_steps(timesteps)}, {_seeds(seeds)}, "
+        f"{head}{env}{_steps(timesteps)}, {_seeds(seeds)}, "
         f"equal settings{_failed(failures, ended)}."
     )
 
 
 def _steps(timesteps: Sequence[int]) -> str:
-    fewest, most = (min(timesteps), max(timesteps)) if timesteps else (0, 0)
-    return f"{most:,} steps" if fewest == most else f"{fewest:,} to {most:,} steps"
+    if not timesteps:
+        return ""
+    fewest, most = min(timesteps), max(timesteps)
+    return f", {most:,} steps" if fewest == most else f", {fewest:,} to {most:,} steps"
 
 
 def _seeds(counts: Sequence[int]) -> str:
@@ -230,7 +236,8 @@ def regularisers(terms: Sequence[Paid], margin: float = MARGIN) -> str:
         return "There are no regularisers."
     paid = [term for term in terms if _has_paid(term)]
     if paid:
-        others = "" if len(paid) == len(terms) else f" {len(terms) - len(paid)} others did not."
+        n = len(terms) - len(paid)
+        others = "" if n == 0 else f" {n} {'other' if n == 1 else 'others'} did not."
         return f"Regularisers paid: {_arrows(paid)}.{others}"
     if all(_is_spared(term, margin) for term in terms):
         return f"Regularisers paid for nothing: {_arrows(terms)}."
@@ -330,12 +337,11 @@ def percent(share: float, sign: bool = False) -> str:
     0 by rounding.
     """
     value = 100.0 * share
-    if value == 0.0:
+    if abs(value) < ROUNDING:
         return "0"
     if abs(value) >= 0.995:
         return f"{value:+,.0f}" if sign else f"{value:,.0f}"
-    text = f"{value:+.1g}" if sign else f"{value:.1g}"
-    return _plain(text)
+    return _digits(value, 1, sign)
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -346,8 +352,7 @@ def number(value: float, digits: int = 3) -> str:
         return "∞" if value > 0 else "-∞"
     if abs(value) >= 10.0**digits:
         return f"{value:,.0f}"
-    text = f"{value:.{digits}g}"
-    return "0" if float(text) == 0.0 else _plain(text)
+    return _digits(value, digits) if value else "0"
 
 
 def signed(value: float) -> str:
@@ -356,10 +361,10 @@ def signed(value: float) -> str:
     return text if text.startswith("-") or text in ("0", "–") else f"+{text}"
 
 
-def _plain(text: str) -> str:
-    """Decimal digits instead of an exponent, for numbers that are not too small."""
-    if "e" not in text:
-        return text
-    value = float(text)
-    decimals = -math.floor(math.log10(abs(value)))
-    return f"{value:+.{decimals}f}" if text.startswith("+") else f"{value:.{min(decimals, 9)}f}"
+def _digits(value: float, digits: int, sign: bool = False) -> str:
+    """So many digits that count, without an exponent unless the number is very small."""
+    if abs(value) < 1e-6:
+        return f"{value:{'+' if sign else ''}.{digits}g}"
+    return np.format_float_positional(
+        float(f"{value:.{digits}g}"), trim="-", fractional=False, sign=sign
+    )

@@ -112,8 +112,7 @@ def methods_of(study: Collected, cells: pd.DataFrame) -> tuple[str, ...]:
     """The methods in the order of the manifest, then any others."""
     names = [str(name) for name in study.manifest.get("methods") or []]
     failed = [failure.method for failure in study.failures]
-    present = [*cells["method"], *failed]
-    return tuple(dict.fromkeys([*(name for name in names if name in present), *present]))
+    return tuple(dict.fromkeys([*names, *cells["method"], *failed]))
 
 
 def scaled(cells: pd.DataFrame, who: Roles) -> Scores:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 #: Configurations up to this number are shown with all their terms.
-MOST_IN_FULL = 4
+MOST_IN_FULL = 2
 #: Configurations beyond this number have no pictures of their own.
 MOST_DETAILED = 13
 #: Curves of single terms beyond this number would not be looked at.
