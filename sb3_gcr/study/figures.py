@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_gcr.study.answers import called, number
 from sb3_gcr.study.contrasts import MARGIN, Contrast
-from sb3_gcr.study.drawing import COLOURS, INK, blank, house_style, looks
+from sb3_gcr.study.drawing import COLOURS, INK, blank, curve_axes, house_style, looks
 from sb3_gcr.study.statistics import mean_interval
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def learning_curves(
     :param title: above the axes
     """
     with house_style():
-        figure, axis = blank(*size)
+        figure, axis = curve_axes(*size)
         for name, (colour, dash) in looks(methods).items():
             own = curves[curves["method"] == name].dropna(subset=[column])
             if own.empty:
@@ -78,7 +78,9 @@ def learning_curves(
             axis.plot(line.steps, line.mean, dash, color=colour, lw=2.0, label=called(name))
         axis.set(ylabel=ylabel, title=title)
         _steps_axis(axis)
-        _legend(axis)
+        handles, labels = axis.get_legend_handles_labels()
+        if handles:
+            figure.legend(handles, labels, loc="upper left", ncols=min(4, len(labels)))
     return figure
 
 
