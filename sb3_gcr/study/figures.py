@@ -225,7 +225,7 @@ def pair_bars(pairs: pd.DataFrame, most: int = 12) -> Figure:
             axis.plot([row.first], [-place], "o", mfc="none", mec=INK, ms=5)
         axis.axvline(0.0, color=INK, lw=0.7)
         axis.set_yticks([-place for place in range(len(top))], list(top["pair"]))
-        axis.set_xlabel("mean cosine in the last tenth of the updates; ring: in the first")
+        axis.set_xlabel("cosine at the end (ring: at first)")
     return figure
 
 

@@ -356,7 +356,7 @@ def conflict_blocks(
             for row in pairs.itertuples()
         ]
         head = ["pair", "levels", "cosine at first", "cosine at last"]
-        table = Table(head, rows, f"All {len(rows)} pairs.", words=2, folded=len(rows) > 10)
+        table = Table(head, rows, "All pairs.", words=2, folded=len(rows) > 10)
         return [
             Heading("Who conflicts with whom", 3),
             Pictures(matrices),
