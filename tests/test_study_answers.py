@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from sb3_gcr.study import answers
+from sb3_gcr.study import answers, words
 from sb3_gcr.study.answers import Paid, Verdict, verdict
 from sb3_gcr.study.contrasts import Contrast, corrected, over_configurations, over_seeds
 from sb3_gcr.study.hypotheses import Judged, status
@@ -391,7 +391,7 @@ def test_the_sentence_of_a_hypothesis() -> None:
     ],
 )
 def test_numbers(value: float, text: str) -> None:
-    assert answers.number(value) == text
+    assert words.number(value) == text
 
 
 @pytest.mark.parametrize(
@@ -399,7 +399,7 @@ def test_numbers(value: float, text: str) -> None:
     [(0.0, "0"), (0.004, "0.4"), (-0.0004, "-0.04"), (0.1449, "14"), (12.0, "1,200")],
 )
 def test_shares(share: float, text: str) -> None:
-    assert answers.percent(share) == text
+    assert words.percent(share) == text
 
 
 def test_a_share_is_of_the_gain_over_random_actions() -> None:

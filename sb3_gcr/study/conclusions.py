@@ -11,7 +11,7 @@ from sb3_gcr.study.contrasts import Contrast, corrected, over_configurations
 from sb3_gcr.study.frames import Frames
 from sb3_gcr.study.hypotheses import Judged, judged
 from sb3_gcr.study.registration import registration
-from sb3_gcr.study.statistics import normalised_score
+from sb3_gcr.study.scores import Scores, scaled
 from sb3_gcr.study.tables import (
     FINAL,
     TRAINING,
@@ -20,14 +20,13 @@ from sb3_gcr.study.tables import (
     compared,
     mean_cosines,
     pair_table,
-    random_return,
     roles,
     sample,
     term_table,
 )
+from sb3_gcr.study.words import called
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
 
 
@@ -52,17 +51,6 @@ class Conclusions(NamedTuple):
     warnings: tuple[str, ...]
     hypotheses: tuple[Judged, ...]
     registration: str
-
-
-class Scores(NamedTuple):
-    """Scaled returns of the configurations in which that is possible, by method and metric.
-
-    :param samples: scores of the seeds, one array a configuration
-    :param left_out: configurations in which the baseline does not beat random actions
-    """
-
-    samples: dict[tuple[str, str], dict[str, np.ndarray]]
-    left_out: tuple[str, ...]
 
 
 def conclude(study: Collected, data: Frames) -> Conclusions:
@@ -113,25 +101,6 @@ def methods_of(study: Collected, cells: pd.DataFrame) -> tuple[str, ...]:
     names = [str(name) for name in study.manifest.get("methods") or []]
     failed = [failure.method for failure in study.failures]
     return tuple(dict.fromkeys([*names, *cells["method"], *failed]))
-
-
-def scaled(cells: pd.DataFrame, who: Roles) -> Scores:
-    """Returns from 0, random actions, to 1, the baseline's mean of the same metric."""
-    samples: dict[tuple[str, str], dict[str, np.ndarray]] = {}
-    left_out = []
-    for name, group in cells.groupby("configuration", sort=False):
-        random = random_return(group)
-        for metric in (TRAINING, FINAL):
-            reference = sample(group, who.baseline, metric)
-            if not len(reference) or not reference.mean() > random:
-                left_out.append(str(name))
-                continue
-            for method in dict.fromkeys(group["method"]):
-                values = sample(group, method, metric)
-                if len(values):
-                    score = normalised_score(values, random, float(reference.mean()))
-                    samples.setdefault((method, metric), {})[str(name)] = score
-    return Scores(samples, tuple(dict.fromkeys(left_out)))
 
 
 def compared_over(scores: Scores, who: Roles) -> Answer:
@@ -274,7 +243,7 @@ def contrast_warnings(configuration: str, cells: pd.DataFrame, found: Answer) ->
         values = sample(group, str(method), TRAINING)
         if len(values) > 1 and values.min() == values.max():
             warnings.append(
-                f"All {len(values)} runs of {answers.called(str(method))} on {configuration} have "
+                f"All {len(values)} runs of {called(str(method))} on {configuration} have "
                 "the same return: does the seed reach the env and the policy?"
             )
     return warnings
@@ -284,6 +253,6 @@ def _left_out(names: Sequence[str], who: Roles) -> list[str]:
     if not names:
         return []
     return [
-        f"Left out of the overall numbers, because {answers.called(who.baseline)} does not beat "
+        f"Left out of the overall numbers, because {called(who.baseline)} does not beat "
         f"random actions there, or one of the two is not known: {', '.join(names)}."
     ]

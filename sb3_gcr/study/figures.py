@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sb3_gcr.study.answers import called, number
 from sb3_gcr.study.contrasts import MARGIN, Contrast
 from sb3_gcr.study.drawing import COLOURS, INK, blank, curve_axes, house_style, looks
 from sb3_gcr.study.statistics import mean_interval
+from sb3_gcr.study.words import called, number
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sb3_gcr.study.contrasts import MARGIN, Contrast, over_configurations, over_seeds
+from sb3_gcr.study.scores import Scores
 from sb3_gcr.study.statistics import Evidence, e_value, holm, registered_looks
 from sb3_gcr.study.store import Record
 from sb3_gcr.study.tables import random_return, sample
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from sb3_gcr.study.conclusions import Scores
 
 ALPHA = 0.05
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from sb3_gcr.study import paper, paper_figures, paper_tables
-from sb3_gcr.study.answers import called, number, p_value, percent
 from sb3_gcr.study.collected import Collected
 from sb3_gcr.study.conclusions import Conclusions
 from sb3_gcr.study.frames import Frames, short
 from sb3_gcr.study.page import Block, Heading, Picture, Pictures, Table, Text
 from sb3_gcr.study.sections import DASH
 from sb3_gcr.study.store import Record
+from sb3_gcr.study.words import called, number, p_value, percent
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -74,7 +74,7 @@ def blocks(study: Collected, data: Frames, found: Conclusions, command: str) -> 
         import matplotlib  # noqa: F401
     except ImportError as error:
         raise ImportError("Reports need matplotlib: pip install 'sb3_gcr[study]'") from error
-    from sb3_gcr.study import paper_sections, sections
+    from sb3_gcr.study import detail_sections, paper_sections, sections
 
     parts = sections.answer_section(found)
     parts += sections.hypothesis_section(found)
@@ -83,7 +83,7 @@ def blocks(study: Collected, data: Frames, found: Conclusions, command: str) -> 
         return [*parts, Text("No cell has finished yet: there is nothing to show.")]
     parts += sections.contrast_section(found)
     parts += sections.method_section(data, found)
-    parts += sections.detail_sections(study, data, found)
+    parts += detail_sections.detail_sections(study, data, found)
     parts += paper_sections.paper_section(study, data, found)
     parts += sections.cell_section(data)
     return [*parts, Heading("Where the numbers come from"), Text(_source(study), "note")]
