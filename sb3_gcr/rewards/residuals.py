@@ -28,6 +28,7 @@ class ResidualWatch:
     def __init__(self, spec: RewardSpec, residual: str):
         self.spec, self.residual = spec, residual
         self._steps: list[NDArray[np.float64]] = []
+        self._is_done = False
 
     def add(self, components: NDArray[np.float64], is_last: bool = False) -> str | None:
         """The components of a step; the sentence about the residual, once there is one.
@@ -35,7 +36,7 @@ class ResidualWatch:
         :param components: shape (N, K)
         :param is_last: whether no more steps follow
         """
-        if self._steps is _DONE:
+        if self._is_done:
             return None
         if len(components):
             self._steps.append(components[:N_ENVS].copy())
@@ -43,11 +44,8 @@ class ResidualWatch:
         if n_rows < max(FEWEST_ROWS if is_last else N_ROWS, 3 * len(self.spec)):
             return None
         steps = np.array(self._steps)
-        self._steps = _DONE
+        self._is_done, self._steps = True, []
         return explain_residual(steps, self.spec, self.residual)
-
-
-_DONE: list[NDArray[np.float64]] = []
 
 
 def explain_residual(steps: NDArray[np.float64], spec: RewardSpec, residual: str) -> str | None:
