@@ -16,6 +16,7 @@ TASKS: dict[str, tuple[str, int]] = {
     "Quadcopter": ("sb3_gcr.envs.tasks.quadcopter", 500),
     "ReachFranka": ("sb3_gcr.envs.tasks.reach", 360),
     "ReachUR10": ("sb3_gcr.envs.tasks.reach", 360),
+    "LocoManipG1": ("sb3_gcr.envs.tasks.locomanip", 700),
     "Hopper": ("sb3_gcr.envs.tasks.planar", 1000),
     "Walker2d": ("sb3_gcr.envs.tasks.planar", 1000),
     "HalfCheetah": ("sb3_gcr.envs.tasks.planar", 1000),

@@ -32,6 +32,15 @@ def into_frame(quaternion: Array, vectors: Array) -> Array:
     return vectors + w * twice + np.cross(axis, twice)
 
 
+def into_world(quaternion: Array, vectors: Array) -> Array:
+    """Vectors in the frame of a rotated body as world vectors, shape (N, 3).
+
+    :param quaternion: of the body, w, x, y, z, shape (N, 4)
+    :param vectors: shape (N, 3)
+    """
+    return into_frame(quaternion * [1, -1, -1, -1], vectors)
+
+
 def wrap(angle: Array) -> Array:
     """An angle between -π and π.
 
