@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("mujoco.batch")
-mujoco = pytest.importorskip("mujoco")
 
 from sb3_gcr.envs.engine import Engine
 from sb3_gcr.envs.tasks import geometry, locomanip
@@ -121,7 +120,9 @@ def test_body_is_the_g1_without_ball() -> None:
     assert all("hip" in name or "knee" in name or "ankle" in name for name in names[task._legs])
     by_name = dict(zip(names, task._default, strict=True))
     assert by_name["left_knee_joint"] == 0.42
-    assert by_name["right_elbow_pitch_joint"] == 0.87
+    assert by_name["right_ankle_pitch_joint"] == -0.17
+    assert by_name["left_shoulder_roll_joint"] == pytest.approx(0.4)
+    assert by_name["right_shoulder_roll_joint"] == pytest.approx(-0.4)
     ankle = model.actuator("left_ankle_roll_joint")
     assert ankle.gainprm[0] == -ankle.biasprm[1] == 150
     assert ankle.forcerange.tolist() == [-40, 40]
@@ -235,7 +236,7 @@ def test_goals_lie_in_front_on_their_own_side() -> None:
         [task.start(np.random.default_rng(seed))["poses"] for seed in range(100)], axis=1
     )
     np.testing.assert_allclose(
-        poses[:, :, :3].mean(1), [[0.21, 0.24, 0.1], [0.21, -0.24, 0.1]], atol=0.02
+        poses[:, :, :3].mean(1), [[0.22, 0.25, 0.08], [0.22, -0.25, 0.08]], atol=0.02
     )
     assert (poses[0, :, 1] > -0.05).all()
     assert (poses[1, :, 1] < 0.05).all()

@@ -87,7 +87,7 @@ def test_goals_are_where_the_paper_has_them() -> None:
 
 
 def test_observation_is_seen_from_the_body() -> None:
-    """Lying on its left side, the world's up is its right... and gravity points to its left."""
+    """Rolled by a quarter turn to its left, it has the ground on its left."""
     engine = flying()
     rows = engine.rows
     half = np.sqrt(0.5)

@@ -23,7 +23,14 @@ from sb3_gcr.envs.tasks.geometry import (
     wrap,
     yaw_and_roll,
 )
-from sb3_gcr.envs.tasks.locomanip_model import ARM, LEG, SIDES, locomanip_model
+from sb3_gcr.envs.tasks.locomanip_model import (
+    ARM,
+    GOAL_JOINTS,
+    LEG,
+    MIRRORED,
+    SIDES,
+    locomanip_model,
+)
 from sb3_gcr.rewards.spec import RewardSpec
 
 #: Physics steps of 5 ms per control step: 50 Hz control.
@@ -48,11 +55,6 @@ STANDING = 0.1
 VELOCITY_STEPS, HAND_STEPS = (150, 400), (50, 150)
 #: Commands that are enough for an episode of 14 s.
 N_VELOCITIES, N_POSES = 5, 14
-#: Joint positions of the left arm at which the hand's goals lie [rad], in the order of ARM; the
-#: right arm's are mirrored.
-GOAL_JOINTS = np.array([(-1.2, 0.5), (0.0, 0.8), (-0.5, 0.5), (-0.2, 1.3), (-0.8, 0.8)])
-#: Which of them change their sign on the right.
-MIRRORED = np.array([1, -1, -1, 1, -1])
 
 
 class LocoManipG1(Task):

@@ -12,6 +12,14 @@ from sb3_gcr.envs.task import Array
 SIDES = ("left", "right")
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow_pitch", "elbow_roll")
+#: Joint positions of the left arm at which the hand's goals lie [rad], in the order of ARM; the
+#: right arm's are mirrored. Their middle is the arms' default pose.
+GOAL_JOINTS = np.array([(-0.9, 0.3), (0.1, 0.7), (-0.4, 0.4), (0.0, 1.1), (-0.5, 0.5)])
+#: Which of them change their sign on the right.
+MIRRORED = np.array([1, -1, -1, 1, -1])
+#: Pitch of the ankles in the default pose [rad]; with the G1's own, -0.23, the arms in front of it
+#: make it fall.
+ANKLE_PITCH = -0.17
 #: Gains of the ankles' servos: those of the hips [N m/rad], [N m s/rad]; the robot's torque [N m].
 ANKLE_STIFFNESS, ANKLE_DAMPING, ANKLE_TORQUE = 150.0, 5.0, 40.0
 #: Bodies whose contact with the floor is felt, beside the feet.
@@ -35,11 +43,18 @@ def locomanip_model() -> tuple[mujoco.MjModel, Array]:
 
 
 def _default_positions(spec: mujoco.MjSpec, moving: set[str]) -> Array:
-    """Those of the keyframe, in the order of the actuators."""
+    """Those of the keyframe for the legs, but for the ankles, and the middle of the goals for the
+    arms; in the order of the actuators.
+    """
     model = spec.compile()
     qpos = model.key("default").qpos
     names = [model.actuator(index).name for index in range(model.nu)]
-    return np.array([qpos[model.joint(name).qposadr[0]] for name in names if name in moving])
+    names = [name for name in names if name in moving]
+    default = np.array([qpos[model.joint(name).qposadr[0]] for name in names])
+    default[["ankle_pitch" in name for name in names]] = ANKLE_PITCH
+    middle = GOAL_JOINTS.mean(1)
+    default[-2 * len(ARM) :] = np.concatenate([middle, MIRRORED * middle])
+    return default
 
 
 def _stiffen(spec: mujoco.MjSpec, moving: set[str]) -> None:
