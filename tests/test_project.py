@@ -147,9 +147,9 @@ ARROWS = {
     "envs.tasks.reach": {"envs.task", "envs.tasks.geometry", "rewards.spec"},
     "envs.tasks.locomanip": {
         "envs.task",
-        "envs.tasks",
         "envs.tasks.geometry",
         "envs.tasks.locomanip_model",
+        "envs.tasks.locomanip_terms",
         "rewards.spec",
     },
     "envs.tasks.locomanip_model": {"envs.task"},

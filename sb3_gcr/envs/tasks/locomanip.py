@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+import sb3_gcr.envs.tasks.locomanip_terms as terms
 from sb3_gcr.envs.task import Array, Rows, Task, unbounded
-from sb3_gcr.envs.tasks import locomanip_terms as terms
 from sb3_gcr.envs.tasks.geometry import (
     angle_between,
     compose,
