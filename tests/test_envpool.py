@@ -28,7 +28,22 @@ from sb3_gcr.simulators.envpool_gym import pool_of
 envpool = pytest.importorskip("envpool")
 
 IDS = sorted(ENVPOOL_ENVS)
-CLIPPED = {"Go1JoystickFlatTerrain-v1", "Go1JoystickRoughTerrain-v1", "H1JoystickGaitTracking-v1"}
+CLIPPED = {
+    "BarkourJoystick-v1",
+    "BerkeleyHumanoidJoystickFlatTerrain-v1",
+    "BerkeleyHumanoidJoystickRoughTerrain-v1",
+    "Go1Footstand-v1",
+    "Go1Getup-v1",
+    "Go1Handstand-v1",
+    "Go1JoystickFlatTerrain-v1",
+    "Go1JoystickRoughTerrain-v1",
+    "H1JoystickGaitTracking-v1",
+    "Op3Joystick-v1",
+    "SpotFlatTerrainJoystick-v1",
+    "SpotGetup-v1",
+    "T1JoystickFlatTerrain-v1",
+    "T1JoystickRoughTerrain-v1",
+}
 
 
 def exactly(message: str) -> str:

@@ -1,4 +1,4 @@
-"""A callback that moves the target of ThrowingMO away as the robot learns."""
+"""Callbacks that make a task harder as the robot learns: a target further away, dearer costs."""
 
 from __future__ import annotations
 
@@ -8,6 +8,54 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_gcr.rewards.layers import env_attributes
+
+
+class WeightCurriculum(BaseCallback):
+    """Raises the two costs of ReachFranka or ReachUR10, action_rate and joint_vel, once, after a
+    number of steps.
+
+    The weights are logged as ``curriculum/action_rate`` and ``curriculum/joint_vel``. The defaults
+    are those of the authors' code.
+
+    :param start: steps of each env after which the weights change
+    :param action_rate: weight from then on, per second
+    :param joint_vel: weight from then on, per second
+    :param verbose: as in SB3
+    """
+
+    def __init__(
+        self,
+        start: int = 4500,
+        action_rate: float = -0.005,
+        joint_vel: float = -0.001,
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        if not start >= 0:
+            raise ValueError(f"Parameter `start` must not be negative, found {start!r}.")
+        self.start = start
+        self.weights = {"action_rate": action_rate, "joint_vel": joint_vel}
+        self.has_started = False
+
+    def _on_training_start(self) -> None:
+        tasks = self.training_env.get_attr("task") if self.training_env.has_attr("task") else [None]
+        if not hasattr(tasks[0], "weights"):
+            raise ValueError(
+                "WeightCurriculum needs the env 'sb3_gcr/ReachFranka-v0' or "
+                "'sb3_gcr/ReachUR10-v0', found one without weights."
+            )
+
+    def _on_step(self) -> bool:
+        is_due = self.num_timesteps >= self.start * self.training_env.num_envs
+        if is_due and not self.has_started:
+            self.has_started = True
+            for task in self.training_env.get_attr("task"):
+                task.weights.update(self.weights)
+        return True
+
+    def _on_rollout_end(self) -> None:
+        for name, weight in self.training_env.get_attr("task")[0].weights.items():
+            self.logger.record(f"curriculum/{name}", weight)
 
 
 class DistanceCurriculum(BaseCallback):

@@ -38,6 +38,31 @@ _GO1 = _levels(
     "feet_clearance feet_height "
     "feet_slip feet_air_time",
 )
+_T1 = _levels(
+    "tracking_lin_vel tracking_ang_vel termination alive",
+    "lin_vel_z ang_vel_xy orientation base_height torques action_rate energy dof_acc dof_vel "
+    "feet_clearance feet_air_time feet_slip feet_height feet_phase feet_distance stand_still "
+    "collision joint_deviation_knee joint_deviation_hip dof_pos_limits pose",
+)
+_BERKELEY = _levels(
+    "tracking_lin_vel tracking_ang_vel termination alive",
+    "lin_vel_z ang_vel_xy orientation base_height torques action_rate energy feet_clearance "
+    "feet_air_time feet_slip feet_height feet_phase stand_still joint_deviation_knee "
+    "joint_deviation_hip dof_pos_limits pose",
+)
+_SPOT_REGULARISERS = (
+    "lin_vel_z ang_vel_xy torques action_rate energy feet_slip feet_clearance feet_height "
+    "feet_air_time feet_phase hip_splay "
+)
+# A Go1 on two legs: height and attitude are what it is to reach.
+_GO1_ON_TWO_LEGS = _levels(
+    "height orientation termination",
+    "contact action_rate dof_pos_limits torques pose stay_still energy dof_acc",
+)
+_CUBE_ROTATION = _levels(
+    "angvel success termination",
+    "linvel pose torques energy action_rate orientation position hand_pose joint_vel",
+)
 #: Levels by info key of the envs whose reward is known to be the sum of these terms.
 ENVPOOL_ENVS: dict[str, dict[str, Level]] = {
     "Ant-v5": _levels("forward survive", "ctrl contact"),
@@ -62,6 +87,41 @@ ENVPOOL_ENVS: dict[str, dict[str, Level]] = {
     ),
     "LeapCubeReorient-v1": _levels(
         "orientation position success termination", "hand_pose joint_vel action_rate energy"
+    ),
+    "T1JoystickFlatTerrain-v1": dict(_T1),
+    "T1JoystickRoughTerrain-v1": dict(_T1),
+    "BerkeleyHumanoidJoystickFlatTerrain-v1": dict(_BERKELEY),
+    "BerkeleyHumanoidJoystickRoughTerrain-v1": dict(_BERKELEY),
+    "SpotFlatTerrainJoystick-v1": _levels(
+        "tracking_lin_vel tracking_ang_vel termination",
+        _SPOT_REGULARISERS + "orientation posture torso_height stand_still",
+    ),
+    # These two are to get up: height and attitude are the task.
+    "SpotGetup-v1": _levels(
+        "orientation torso_height posture stand_still tracking_lin_vel tracking_ang_vel "
+        "termination",
+        _SPOT_REGULARISERS,
+    ),
+    "Go1Getup-v1": _levels(
+        "orientation torso_height posture stand_still",
+        "action_rate dof_pos_limits torques dof_acc dof_vel",
+    ),
+    "Go1Handstand-v1": dict(_GO1_ON_TWO_LEGS),
+    "Go1Footstand-v1": dict(_GO1_ON_TWO_LEGS),
+    "BarkourJoystick-v1": _levels(
+        "tracking_lin_vel tracking_ang_vel termination",
+        "lin_vel_z ang_vel_xy orientation torques action_rate stand_still feet_air_time",
+    ),
+    "Op3Joystick-v1": _levels(
+        "tracking_lin_vel tracking_ang_vel termination",
+        "lin_vel_z ang_vel_xy orientation torques action_rate zero_cmd feet_slip feet_clearance "
+        "energy",
+    ),
+    "LeapCubeRotateZAxis-v1": dict(_CUBE_ROTATION),
+    "AeroCubeRotateZAxis-v1": dict(_CUBE_ROTATION),
+    "PandaPickCubeOrientation-v1": _levels(
+        "gripper_box box_target lifted success",
+        "no_floor_collision no_box_collision no_barrier_collision robot_target_qpos",
     ),
     "PandaPickCube-v1": _levels("gripper_box box_target", "no_floor_collision robot_target_qpos"),
     "PandaOpenCabinet-v1": _levels(
