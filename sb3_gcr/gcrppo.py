@@ -56,10 +56,9 @@ class GCRPPO(Saving, MultiHeadPPO):
     and gradient per component.
 
     The env must report its reward components (see
-    :class:`~sb3_gcr.components.RewardDecomposition`); an id of Gymnasium's MuJoCo envs such as
-        ``"Humanoid-v5"`` is taken apart by itself. Without components it is SB3's PPO. All
-        parameters of
-    SB3's PPO keep their names, order and defaults; these are added:
+    :class:`~sb3_gcr.rewards.decomposition.RewardDecomposition`); an id of Gymnasium's MuJoCo envs
+    such as ``"Humanoid-v5"`` is taken apart by itself. Without components it is SB3's PPO. All
+    parameters of SB3's PPO keep their names, order and defaults; these are added:
 
     :param resolver: name in ``RESOLVERS``, or a callable ``(gramian (K, K), levels (K,), rng) ->
         weights (K,)``
