@@ -6,7 +6,9 @@ Run ``python examples/reachability.py`` to print it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import mujoco
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 
 from sb3_gcr.envs.engine import Engine
 from sb3_gcr.envs.task import Task
-from sb3_gcr.envs.tasks import humanoid, throwing
+from sb3_gcr.envs.tasks import humanoid, planar_mo, throwing
 
 Array = NDArray[Any]
 
@@ -81,6 +83,15 @@ JUMPS: tuple[dict[str, Any], ...] = (
         ),
     },
 )
+
+
+#: Actions of hip, knee and ankle of each leg of a planar robot; the cheetah's are thigh, shin and
+#: foot.
+LEGS: dict[str, tuple[slice, ...]] = {
+    "Walker2dMO": (slice(0, 3), slice(3, 6)),
+    "HopperMO": (slice(0, 3),),
+    "HalfCheetahMO": (slice(0, 3), slice(3, 6)),
+}
 
 
 @dataclass
@@ -251,35 +262,104 @@ def throwing_motions() -> list[Motion]:
     return motions
 
 
+def planar_motions(name: str) -> list[Motion]:
+    """From the start of an episode: torques that stay, swinging joints, a walker on one leg, and a
+    cheetah that sits.
+
+    :param name: a key of ``LEGS``
+    """
+    legs = LEGS[name]
+    n_actions = 3 * len(legs)
+    n_steps = one_second(PLANAR[name]())
+    rng = np.random.default_rng(0)
+
+    def hold(*torques: tuple[float, ...]) -> Array:
+        """The same torques of hip, knee and ankle in each step, for each leg."""
+        actions = np.zeros((n_steps, n_actions))
+        for leg, torque in zip(legs, torques, strict=True):
+            actions[:, leg] = torque
+        return actions
+
+    motions = []
+    for torque in product((-1, 0, 0.3, 1), repeat=3):
+        hip, knee, ankle = (round(100 * part) for part in torque)
+        what = f"hip at {hip} %, knee at {knee} %, ankle at {ankle} % of the torque"
+        motions.append(Motion(what, None, None, hold(*[torque] * len(legs))))
+    time = np.linspace(0, 1, n_steps, endpoint=False)[:, None]
+    for amplitude, frequency in product((0.1, 0.2, 0.3, 0.5, 0.7, 1), (1, 2, 3, 4)):
+        swing = amplitude * np.sin(2 * np.pi * (frequency * time + rng.random(n_actions)))
+        what = f"swing all joints at {frequency} Hz with {100 * amplitude:.0f} % of the torque"
+        motions.append(Motion(what, None, None, swing))
+    if name == "Walker2dMO":
+        for lifted, standing in product((0, 1), repeat=2):
+            actions = hold((1, -1, lifted), (1, 1, standing))
+            what = f"stand on one leg, ankles at {100 * standing} % and {100 * lifted} %"
+            motions.append(Motion(what, None, None, actions))
+    if name == "HalfCheetahMO":
+        actions = hold((1, 1, 1), (0, 1, 1))
+        motions.append(Motion("sit on the rear leg, front leg stretched", None, None, actions))
+    return motions
+
+
+def one_second(task: Task) -> int:
+    """Control steps in a second.
+
+    :param task: any
+    """
+    return round(1 / task.dt)
+
+
+PLANAR: dict[str, type[planar_mo.PlanarMO]] = {
+    "Walker2dMO": planar_mo.Walker2dMO,
+    "HopperMO": planar_mo.HopperMO,
+    "HalfCheetahMO": planar_mo.HalfCheetahMO,
+}
 UNITS = {"energy": "W", "gait": "m", "baseh": "m", "armsp": "m"}
 UNITS |= {"ballrel": "s", "bodymo": "m/s", "lftarm": "m", "rgtarm": "m"}
+UNITS |= {"lean": "rad", "knee": "rad"}
+
+
+@dataclass
+class Trial:
+    """What is tried on a task.
+
+    :param make: the task, with an index for each objective
+    :param ranges: all ranges by objective
+    :param motions: what to try
+    :param n_steps: control steps
+    """
+
+    make: Callable[..., Task]
+    ranges: planar_mo.Ranges
+    motions: list[Motion]
+    n_steps: int
+
+
+def trial(task: str) -> Trial:
+    """What is tried on a task.
+
+    :param task: "HumanoidMO", "ThrowingMO", or a key of ``PLANAR``
+    """
+    if task == "HumanoidMO":
+        return Trial(humanoid.HumanoidMO, humanoid.RANGES, humanoid_motions(), 90)
+    if task == "ThrowingMO":
+        n_steps = throwing.EPISODE_STEPS
+        return Trial(throwing.ThrowingMO, throwing.RANGES, throwing_motions(), n_steps)
+    make = PLANAR[task]
+    return Trial(make, make.all_ranges, planar_motions(task), one_second(make()))
 
 
 def table(task: str) -> list[tuple[str, str, float, str]]:
     """Objective, range, pay and motion for each range of a task.
 
-    :param task: "HumanoidMO" or "ThrowingMO"
+    :param task: "HumanoidMO", "ThrowingMO", or a key of ``PLANAR``
     """
-    make: type[Task]
-    if task == "HumanoidMO":
-        make, ranges, motions, n_steps = (
-            humanoid.HumanoidMO,
-            humanoid.RANGES,
-            humanoid_motions(),
-            90,
-        )
-    else:
-        make, ranges, motions, n_steps = (
-            throwing.ThrowingMO,
-            throwing.RANGES,
-            throwing_motions(),
-            throwing.EPISODE_STEPS,
-        )
+    tried = trial(task)
     found = []
     for index in range(5):
-        built: Task = make(**dict.fromkeys(ranges, index))
-        paid = pays(built, motions, n_steps)
-        for name, bounds in ranges.items():
+        built = tried.make(**dict.fromkeys(tried.ranges, index))
+        paid = pays(built, tried.motions, tried.n_steps)
+        for name, bounds in tried.ranges.items():
             column = paid[:, built.reward_spec.names.index(f"{name}_range")]
             best = int(np.argmax(column))
             low, high = bounds[index]
@@ -288,14 +368,14 @@ def table(task: str) -> list[tuple[str, str, float, str]]:
                     name,
                     f"{low:g} to {high:g} {UNITS[name]}",
                     float(column[best]),
-                    motions[best].what,
+                    tried.motions[best].what,
                 )
             )
-    return sorted(found, key=lambda row: list(ranges).index(row[0]))
+    return sorted(found, key=lambda row: list(tried.ranges).index(row[0]))
 
 
 if __name__ == "__main__":
-    for task_name in ("HumanoidMO", "ThrowingMO"):
+    for task_name in ("HumanoidMO", "ThrowingMO", *PLANAR):
         print(f"\n{task_name}\n\n| objective | range | paid | by |\n|---|---|---|---|")
         for objective, bounds, pay, what in table(task_name):
             print(f"| `{objective}` | {bounds} | {pay:.3g} | {what} |")
