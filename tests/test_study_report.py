@@ -767,3 +767,79 @@ def test_figures_are_no_pyplot_figures() -> None:
     figure = figures.learning_curves(data_of(all_cells()).curves, METHODS)
     assert type(figure) is Figure
     assert "pyplot" not in str(type(figure.canvas.manager))
+
+
+def dosed(weights: tuple[float, ...], gains: tuple[float, ...]) -> list[Result]:
+    """GCRPPO's gains over the heads, which return 100, at growing weights and conflicts."""
+    cells = []
+    for weight, gain in zip(weights, gains, strict=True):
+        for seed, off in enumerate((-0.01, 0.0, 0.01)):
+            for method, value in (("multi_head", 100.0), ("gcr", 100.0 * (1 + gain + off))):
+                cells.append(
+                    result(
+                        method,
+                        seed,
+                        value,
+                        env_kwargs={"regulariser_weight": weight},
+                        conflicts=float(weight),
+                    )
+                )
+    return cells
+
+
+@pytest.mark.parametrize(
+    ("gains", "status", "numbers"),
+    [
+        ((0.0, 0.1, 0.3), "supported", "+15 % for three times the dose (12 to 18)"),
+        ((0.01, 0.01, 0.01), "refuted", "0 % for three times the dose (-0.9 to 0.9)"),
+        ((0.3, 0.1, 0.0), "open", "-15 % for three times the dose (-18 to -12)"),
+    ],
+)
+def test_the_rule_of_slopes(gains: tuple[float, ...], status: str, numbers: str) -> None:
+    """By hand, first case: x is 0, 1, 2 thrice, the slope .15, its error sqrt(.0056 / 7 / 6),
+    and t of 7 is 2.3646.
+    """
+    from sb3_gcr.study.rules import slopes_rule
+
+    data = data_of(dosed((1, 3, 9), gains))
+    found, sentence = slopes_rule(data.cells, data.factors, "multi_head", "gcr", "return_training")
+    assert found == status
+    assert numbers in sentence
+    assert sentence.endswith("from 9 pairs of runs.")
+
+
+@pytest.mark.parametrize(
+    ("raw", "scaled", "status"),
+    [
+        ((0.4, 0.42), (0.1, 0.1), "supported"),
+        ((0.3, 0.34), (0.2, 0.3), "refuted"),
+        ((0.02, 0.6), (0.1, 0.1), "open"),
+    ],
+)
+def test_the_rule_of_two_variants(
+    raw: tuple[float, float], scaled: tuple[float, float], status: str
+) -> None:
+    from sb3_gcr.study.rules import variants_rule
+    from sb3_gcr.study.scores import scaled as scores_of
+
+    cells = [
+        result(
+            method,
+            0,
+            100.0 * (1 + (gain if method == "multi_head" else 0)),
+            env_kwargs={"energy": energy},
+            settings={"normalize_reward": is_scaled},
+        )
+        for is_scaled, gains in ((False, raw), (True, scaled))
+        for energy, gain in enumerate(gains)
+        for method in ("ppo", "multi_head")
+    ]
+    data = data_of(cells)
+    who = tables.roles(["ppo", "multi_head"])
+    assert who is not None
+    found, sentence = variants_rule(
+        scores_of(data.cells, who), data.factors, "ppo", "multi_head", "return_training"
+    )
+    assert found == status
+    assert sentence.startswith(f"Raw gain +{100 * sum(raw) / 2:.0f} %, scaled gain +")
+    assert sentence.endswith(" in 2 configurations.")

@@ -278,6 +278,8 @@ def hypothesis(one: Judged) -> str:
     lead = f"{one.name}, {words}: {one.claim.rstrip('.')}."
     if one.contrast is None:
         return f"{lead} No unit has both methods yet."
+    if one.detail:
+        return f"{lead} {one.detail}"
     c = one.contrast
     unit = "seeds" if c.kind == "Welch" else "configurations"
     interval = f" ({ends(c)}, {c.kind})" if c.has_interval else ""

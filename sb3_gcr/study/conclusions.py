@@ -72,7 +72,7 @@ def conclude(study: Collected, data: Frames) -> Conclusions:
             by_configuration[name] = compared(cells, who)
             warnings += contrast_warnings(name, cells, by_configuration[name])
         scores = scaled(data.cells, who)
-        hypotheses = judged(study.manifest, data.cells, scores)
+        hypotheses = judged(study.manifest, data.cells, data.factors, scores)
         if len(configurations) > 1:
             overall = compared_over(scores, who)
             warnings += _left_out(scores.left_out, who)

@@ -40,7 +40,8 @@ class Frames(NamedTuple):
     :param terms: one row a term of a cell: level, return over training, return at the end
     :param curves: one row a window of a cell: step, return, conflicts, conflict_rate
     :param term_curves: one row a term in a window of a cell: step, return, weight
-    :param factors: one row a configuration: its env, and one column for each of its keywords
+    :param factors: one row a configuration: its env, its variant, which is that in which its
+        settings differ from those of others, and one column for each keyword of an env
     """
 
     cells: pd.DataFrame
@@ -61,7 +62,9 @@ def frames(results: Sequence[Record], tasks: Sequence[Record] = ()) -> Frames:
         import pandas as pd
     except ImportError as error:
         raise ImportError("Reports need pandas: pip install 'sb3_gcr[study]'") from error
-    names = labels([result["cell"] for result in results], tasks)
+    all_cells = [result["cell"] for result in results]
+    names = labels(all_cells, tasks)
+    varied = _varied(all_cells)
     cells: list[dict[str, Any]] = []
     terms: list[dict[str, Any]] = []
     curves: list[dict[str, Any]] = []
@@ -75,7 +78,11 @@ def frames(results: Sequence[Record], tasks: Sequence[Record] = ()) -> Frames:
             "method": cell["method"],
             "seed": cell["seed"],
         }
-        factors[name] = {"env": cell["env"], **(cell.get("env_kwargs") or {})}
+        factors[name] = {
+            "env": cell["env"],
+            "variant": _variant(cell, varied),
+            **(cell.get("env_kwargs") or {}),
+        }
         cells.append(key | _cell(result))
         terms += [key | row for row in _terms(result)]
         curves += [key | row for row in _windows(result)]
@@ -125,6 +132,12 @@ def _described(cell: Record, varied: Sequence[str]) -> str:
     flat = _flat(cell)
     words = [f"{key}={flat[key]}" for key in varied if flat.get(key) is not None]
     return " ".join([cell["env"], *words])
+
+
+def _variant(cell: Record, varied: Sequence[str]) -> str:
+    """Settings and steps in which configurations differ; their keywords are no part of it."""
+    own = {"timesteps": cell["timesteps"], **(cell.get("settings") or {})}
+    return " ".join(f"{key}={own[key]}" for key in varied if key in own)
 
 
 def short(configuration: str) -> str:

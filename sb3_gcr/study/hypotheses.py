@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sb3_gcr.study import rules
 from sb3_gcr.study.contrasts import MARGIN, Contrast, over_configurations, over_seeds
 from sb3_gcr.study.scores import Scores
 from sb3_gcr.study.statistics import Evidence, e_value, holm, registered_looks
@@ -33,6 +34,7 @@ class Judged(NamedTuple):
     :param evidence: e-value on wins, which may be looked at any time; None for seeds
     :param status: ``supported``, ``refuted``, ``opposite``, ``open`` or ``no look yet``
     :param rules: what the manifest calls supported and refuted
+    :param detail: the numbers of a rule that is none of p and interval
     """
 
     name: str
@@ -45,13 +47,17 @@ class Judged(NamedTuple):
     evidence: Evidence | None
     status: str
     rules: tuple[str, str]
+    detail: str = ""
 
 
-def judged(manifest: Record, cells: pd.DataFrame, scores: Scores) -> list[Judged]:
+def judged(
+    manifest: Record, cells: pd.DataFrame, factors: pd.DataFrame, scores: Scores
+) -> list[Judged]:
     """All hypotheses of a manifest, Holm-corrected together.
 
     :param manifest: with hypotheses and looks
     :param cells: one row a cell
+    :param factors: one row a configuration
     :param scores: scaled returns by configuration, in the order of the manifest's tasks
     """
     looks = tuple(manifest.get("looks") or ())
@@ -59,10 +65,38 @@ def judged(manifest: Record, cells: pd.DataFrame, scores: Scores) -> list[Judged
         _examined(str(name), one, looks, cells, scores)
         for name, one in (manifest.get("hypotheses") or {}).items()
     ]
+    found = [with_own_rule(one, cells, factors, scores) for one in found]
     # One that has not been looked at counts as p = 1, so that the family never grows later.
     p_values = [1.0 if math.isnan(one.p) else one.p for one in found]
     adjusted = holm(p_values) if found else np.array([])
-    return [_with_status(one, float(p)) for one, p in zip(found, adjusted, strict=True)]
+    return [
+        one if one.detail else _with_status(one, float(p))
+        for one, p in zip(found, adjusted, strict=True)
+    ]
+
+
+def with_own_rule(
+    one: Judged, cells: pd.DataFrame, factors: pd.DataFrame, scores: Scores
+) -> Judged:
+    """The hypothesis, judged already where its rule is about slopes or about two variants.
+
+    :param one: with the contrast that it is about
+    :param cells: one row a cell
+    :param factors: one row a configuration
+    :param scores: scaled returns
+    """
+    if one.contrast is None:
+        return one
+    c = one.contrast
+    if "slope" in one.rules[0]:
+        found = rules.slopes_rule(cells, factors, c.baseline, c.method, c.metric)
+    elif "raw gain" in one.rules[0]:
+        found = rules.variants_rule(scores, factors, c.baseline, c.method, c.metric)
+    else:
+        return one
+    status, detail = found
+    nan = math.nan
+    return one._replace(status=status, detail=detail, p=nan, holm=nan, look=0, evidence=None)
 
 
 def _examined(
@@ -70,9 +104,9 @@ def _examined(
 ) -> Judged:
     method, baseline = hypothesis["contrast"]
     metric = hypothesis["metric"]
-    rules = (str(hypothesis["supported"]), str(hypothesis["refuted"]))
+    registered = (str(hypothesis["supported"]), str(hypothesis["refuted"]))
     empty = Judged(
-        name, str(hypothesis["claim"]), None, 0, 0, math.nan, math.nan, None, "open", rules
+        name, str(hypothesis["claim"]), None, 0, 0, math.nan, math.nan, None, "open", registered
     )
     if hypothesis["unit"] == "seed":
         return _over_seeds(empty, method, baseline, metric, looks, cells)

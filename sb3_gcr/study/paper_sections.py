@@ -159,13 +159,13 @@ def win_blocks(data: Frames, found: Conclusions) -> list[Block]:
     """Tables 2 and 3 with their heat maps, one of each env with objectives."""
     assert found.who is not None
     blocks: list[Block] = []
-    for env, factors in data.factors.groupby("env", sort=False):
+    for (env, variant), factors in data.factors.groupby(["env", "variant"], sort=False):
         own = factors.dropna(axis=1, how="all")
-        cells = data.cells[data.cells["env"] == env]
+        cells = data.cells[data.cells["configuration"].isin(factors.index)]
         wins = paper_tables.win_frame(cells, own, found.who.baseline, found.who.main)
         if wins.empty or not paper_tables.objectives(own):
             continue
-        name = short(str(env))
+        name = " ".join([short(str(env)), *([str(variant)] if variant else [])])
         table = paper_tables.win_table(wins)
         total = int(wins["won"].sum())
         columns: list[int | str] = [*paper_tables.LEVELS, paper_tables.ABSENT, "active"]
@@ -184,7 +184,7 @@ def win_blocks(data: Frames, found: Conclusions) -> list[Block]:
         blocks.append(Table([*head, "p active against NA (Fisher)"], rows, caption))
         pictures = [
             Picture(
-                f"wins_{name}",
+                f"wins_{name.replace(' ', '_')}",
                 paper_figures.win_heat_map(table),
                 f"{name}: share of wins by objective and level (configurations).",
             )
@@ -193,7 +193,7 @@ def win_blocks(data: Frames, found: Conclusions) -> list[Block]:
         if not pairs.empty:
             pictures.append(
                 Picture(
-                    f"wins_of_pairs_{name}",
+                    f"wins_of_pairs_{name.replace(' ', '_')}",
                     paper_figures.pair_heat_map(pairs),
                     f"{name}: share of wins where both objectives are active (configurations).",
                 )

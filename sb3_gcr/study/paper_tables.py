@@ -185,11 +185,15 @@ def win_frame(
 
 
 def objectives(factors: pd.DataFrame) -> list[str]:
-    """Columns that hold a level of a range, or nothing, in every configuration."""
+    """Columns that hold a level of a range, or nothing, in every configuration, and not the same
+    in all of them.
+    """
     return [
         name
         for name in factors.columns
-        if name != "env" and all(level_of(value) is not None for value in factors[name])
+        if name not in ("env", "variant")
+        and len({level_of(value) for value in factors[name]}) > 1
+        and all(level_of(value) is not None for value in factors[name])
     ]
 
 
