@@ -54,7 +54,7 @@ class MultiHeadPPO(PPO):
     }
 
     #: Attributes that are in no file; see ``saving.model``.
-    unsaved: ClassVar[tuple[str, ...]] = ("_reader",)
+    unsaved: ClassVar[tuple[str, ...]] = ("_reader", "_ended_returns", "_is_monitored")
     #: See :class:`~sb3_gcr.saving.model.Saving`.
     saved_numbers: ClassVar[tuple[str, ...]] = ("_has_paid",)
 
@@ -70,6 +70,7 @@ class MultiHeadPPO(PPO):
         self._has_paid: list[int] = []
         self._ended_returns: dict[int, float] = {}
         self._reader: ComponentReader | None = None
+        self._is_monitored = False
         super().__init__(*args, **kwargs)
 
     @property

@@ -1,10 +1,8 @@
-"""A wrapper that collects the terms of a reward from the info dict, and the table of Gymnasium's
-envs that report them.
-"""
+"""A wrapper that collects the terms of a reward from the info dict."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -13,52 +11,11 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_gcr.checks import check_number
+from sb3_gcr.rewards.gymnasium_envs import GYMNASIUM_ENVS as GYMNASIUM_ENVS
+from sb3_gcr.rewards.sources import Calls, Terms, TermSource, Weights
 from sb3_gcr.rewards.spec import COMPONENTS_KEY, ERROR_KEY, Level, RewardSpec
 from sb3_gcr.rewards.sums import SUM_TOLERANCE, adds_up, find_fault
-from sb3_gcr.rewards.values import Components, as_array, as_vector, collect, leaves
-
-#: What the terms are multiplied by: all of them, each by name, or what a function of the env says.
-Weights = float | Mapping[str, float] | Callable[[gym.Env[Any, Any]], "float | Mapping[str, float]"]
-
-_RUNNING = {"reward_forward": "task", "reward_survive": "task", "reward_ctrl": "regulariser"}
-
-
-_RUNNING_WITH_CONTACT = {**_RUNNING, "reward_contact": "regulariser"}
-
-
-_CRUISING = {"reward_forward": "task", "reward_ctrl": "regulariser"}
-
-
-#: Arguments of :class:`RewardDecomposition` for Gymnasium's MuJoCo envs whose info reports the
-#: terms of their reward.
-GYMNASIUM_ENVS: dict[str, dict[str, Any]] = {
-    "Ant-v5": {"components": _RUNNING_WITH_CONTACT},
-    "Humanoid-v5": {"components": _RUNNING_WITH_CONTACT},
-    "HalfCheetah-v5": {"components": _CRUISING},
-    "Swimmer-v5": {"components": _CRUISING},
-    "Hopper-v5": {"components": _RUNNING},
-    "Walker2d-v5": {"components": _RUNNING},
-    "Pusher-v5": {
-        "components": {"reward_dist": "task", "reward_near": "task", "reward_ctrl": "regulariser"}
-    },
-    "Reacher-v5": {"components": {"reward_dist": "task", "reward_ctrl": "regulariser"}},
-    "HumanoidStandup-v5": {
-        "components": {
-            "reward_linup": "task",
-            "reward_quadctrl": "regulariser",
-            "reward_impact": "regulariser",
-        },
-        "residual": "alive",
-    },
-    "InvertedDoublePendulum-v5": {
-        "components": {
-            "reward_survive": "task",
-            "distance_penalty": "regulariser",
-            "velocity_penalty": "regulariser",
-        }
-    },
-    "InvertedPendulum-v5": {"components": {"reward_survive": "task"}},
-}
+from sb3_gcr.rewards.values import Components, as_array, leaves
 
 
 class RewardDecomposition(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -85,6 +42,13 @@ class RewardDecomposition(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConst
     :param weights: what the terms are multiplied by before they are added up: a number, weights by
         name (1 where there is none), or a function of the env that returns either. None multiplies
         vectors by ``info["reward_weights"]``, where that is present; ``weights=1`` does not
+    :param under: key or path of a dictionary in the info that has the terms
+    :param cumulative: whether the terms are running totals of an episode, so that the reward is
+        their increase
+    :param terms: a function of the env and the info of a step that returns the terms by name
+    :param calls: names of methods of the env that return terms while it steps, by name of the
+        component or as a list, whose entries are the names of both; of several calls in a step the
+        sum counts. ``"part.method"`` names one of a part of the env
     :raises ValueError: if ``components`` is None and the env is not in the table, or if a name
         appears twice
     """
@@ -96,10 +60,29 @@ class RewardDecomposition(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConst
         residual: str | Mapping[str, Level] | None = None,
         tolerance: float = SUM_TOLERANCE,
         weights: Weights | None = None,
+        *,
+        under: str | None = None,
+        cumulative: bool = False,
+        terms: Terms | None = None,
+        calls: Calls | None = None,
     ):
-        options: dict[str, Any] = {} if weights is None else {"weights": weights}
+        options = {
+            name: value
+            for name, value in [
+                ("weights", weights),
+                ("under", under),
+                ("cumulative", cumulative or None),
+                ("terms", terms),
+                ("calls", calls),
+            ]
+            if value is not None
+        }
         gym.utils.RecordConstructorArgs.__init__(
-            self, components=components, residual=residual, tolerance=tolerance, **options
+            self,
+            components=components,
+            residual=residual,
+            tolerance=tolerance,
+            **options,  # type: ignore[arg-type]
         )
         gym.Wrapper.__init__(self, env)
         if components is None:
@@ -125,11 +108,13 @@ class RewardDecomposition(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConst
             tuple(name for name, _ in pairs),
             tuple(level for _, level in pairs),  # type: ignore[misc]
         )
-        self._names = self.reward_spec.names[: len(pairs) - len(self.residual)]
-        self.weights = weights
-        _check_weights(weights, self._names)
+        names = self.reward_spec.names[: len(pairs) - len(self.residual)]
         _refuse_monitored_vectors(env)
+        self._source = TermSource(
+            env, self.components, names, under, weights, cumulative, terms, calls
+        )
         self._returns = np.zeros(len(self.reward_spec))
+        self._raw = np.zeros(len(names))
         self._written: dict[str, Any] = {}
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
@@ -138,7 +123,10 @@ class RewardDecomposition(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConst
         :param kwargs: ``seed`` and ``options``
         """
         self._returns = np.zeros(len(self.reward_spec))
-        return super().reset(**kwargs)
+        observation, info = super().reset(**kwargs)
+        self._source.begin(info)
+        self._raw = np.zeros_like(self._raw)
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the env and add the components, or the sentence that says what is wrong with them,
@@ -146,6 +134,7 @@ class RewardDecomposition(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConst
 
         :param action: an action of the env
         """
+        self._source.forget_calls()
         observation, reward, terminated, truncated, info = self.env.step(action)
         if not isinstance(info, dict):
             info = {ERROR_KEY: f"`info` must be a dictionary, found {info!r}."}
@@ -170,45 +159,48 @@ class RewardDecomposition(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConst
         if rewards.size != 1:
             return self._from_vector(rewards)
         total = float(rewards[0])
-        vector_weights = info.get("reward_weights") if self.weights is None else None
-        terms = np.array(collect(self.components, info, "info", vector_weights))
-        row = self._complete(terms * self._current_weights(), total)
-        if vector_weights is not None and not adds_up(row, total, self.reward_tolerance):
-            unweighted = np.array(collect(self.components, info, "info"))
-            if adds_up(self._complete(unweighted, total), total, self.reward_tolerance):
-                raise ValueError(
-                    'The terms add up to the reward without `info["reward_weights"]`, which they '
-                    "seem to contain already: give `RewardDecomposition(weights=1)`."
-                )
+        before = self._raw
+        terms, self._raw = self._source.read(info)
+        row = self._complete(terms, total)
         fault = find_fault(row[None], np.array([total]), self.reward_spec, self.reward_tolerance)
-        if fault is not None:
-            raise ValueError(fault.sentence)
-        return row
+        if fault is None:
+            return row
+        if fault.is_sum:
+            raise ValueError(self._cause(self._raw, before, total) or fault.sentence)
+        raise ValueError(fault.sentence)
+
+    def _cause(
+        self, raw: NDArray[np.float64], before: NDArray[np.float64], reward: float
+    ) -> str | None:
+        """What explains that terms do not add up which came as ``raw``, and in the step before as
+        ``before``.
+        """
+        if self._source.weights is None and adds_up(raw, reward, self.reward_tolerance):
+            return (
+                'The terms add up to the reward without `info["reward_weights"]`, which they seem '
+                "to contain already: give `RewardDecomposition(weights=1)`."
+            )
+        growth = (raw - before) * self._source.current_weights()
+        if before.any() and adds_up(growth, reward, self.reward_tolerance):
+            return (
+                "The terms are running totals: the reward is by how much they have grown since "
+                "the step before. Give `RewardDecomposition(cumulative=True)`."
+            )
+        return None
 
     def _from_vector(self, rewards: NDArray[np.float64]) -> NDArray[np.float64]:
         """The components of a vector reward, which are its entries in the order of the names."""
-        if self.residual or len(self._names) != len(rewards):
+        if self.residual or len(self.reward_spec) != len(rewards):
             raise ValueError(
                 f"The reward is a vector of {len(rewards)} entries: parameter `components` must "
                 f"name each of them in order, without a residual, found "
                 f"{list(self.reward_spec.names)}."
             )
-        row = rewards * self._current_weights()
+        row = rewards * self._source.current_weights()
         fault = find_fault(row[None], row[None].sum(1), self.reward_spec, np.inf)
         if fault is not None:
             raise ValueError(fault.sentence)
         return row
-
-    def _current_weights(self) -> NDArray[np.float64]:
-        """The weight of each named component in this step."""
-        weights = self.weights(self.env) if callable(self.weights) else self.weights
-        if weights is None:
-            return np.ones(len(self._names))
-        if not isinstance(weights, Mapping):
-            return np.full(len(self._names), as_vector(weights, "Parameter `weights`", 1)[0])
-        if callable(self.weights):
-            return np.array(collect(dict.fromkeys(self._names, 0), weights, "weights(env)"))
-        return np.array([float(weights.get(name, 1)) for name in self._names])
 
     def _complete(self, terms: NDArray[np.float64], reward: float) -> NDArray[np.float64]:
         """The terms with the residual, if there is one."""
@@ -246,22 +238,6 @@ def _scalar(reward: Any) -> Any:
         return float(as_array(reward, "").sum())
     except ValueError:  # the info has the sentence
         return np.nan
-
-
-def _check_weights(weights: Any, names: tuple[str, ...]) -> None:
-    """Refuse weights that are no numbers, or have other names than the components."""
-    if weights is None or callable(weights):
-        return
-    if not isinstance(weights, Mapping):
-        check_number("weights", weights)
-        return
-    for name, weight in weights.items():
-        if name not in names:
-            raise ValueError(
-                f"Parameter `weights` must have the names of components, found {name!r}: valid "
-                f"choices are {list(names)}."
-            )
-        check_number(f'weights["{name}"]', weight)
 
 
 def _refuse_monitored_vectors(env: gym.Env[Any, Any]) -> None:

@@ -10,8 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS, vector_length
-from sb3_gcr.rewards.layers import env_attributes, layers_of, outermost_attribute, own_attribute
+from sb3_gcr.rewards.decomposition import vector_length
+from sb3_gcr.rewards.gymnasium_envs import GYMNASIUM_ENVS
+from sb3_gcr.rewards.layers import (
+    Placed,
+    env_attributes,
+    layers_of,
+    outermost_attribute,
+    own_attribute,
+    placed_specs,
+)
+from sb3_gcr.rewards.layers import find_reward_spec as find_reward_spec
 from sb3_gcr.rewards.residuals import ResidualWatch
 from sb3_gcr.rewards.spec import COMPONENTS_KEY, ERROR_KEY, RewardSpec
 from sb3_gcr.rewards.sums import (
@@ -21,64 +30,6 @@ from sb3_gcr.rewards.sums import (
     sum_sentence,
 )
 from sb3_gcr.rewards.values import as_array, as_vector, collect
-
-
-def find_reward_spec(env: VecEnv) -> RewardSpec | None:
-    """The spec that the outermost layer of a VecEnv carries as ``reward_spec``, or each of its
-    envs; None where there is none.
-
-    :param env: a VecEnv
-    :raises TypeError: if ``reward_spec`` is neither a RewardSpec nor a mapping of names to levels
-    :raises ValueError: if the envs disagree
-    """
-    specs = _specs(env)
-    return specs[0].spec if specs else None
-
-
-class _Placed(NamedTuple):
-    """A spec, and the depth of the layer that carries it; the outermost has depth 0."""
-
-    spec: RewardSpec
-    depth: int
-
-
-def _specs(env: VecEnv) -> list[_Placed]:
-    """All specs from outside to inside; that of the envs is as deep as the innermost layer."""
-    layers = layers_of(env)
-    found: list[_Placed] = []
-    for depth, layer in enumerate(layers):
-        spec = own_attribute(layer, "reward_spec")
-        if spec is not None and not callable(spec):  # a method of that name is somebody else's
-            found.append(_Placed(_as_spec(spec), depth))
-    if not found or found[-1].depth < len(layers) - 1:
-        inside = _spec_of_envs(env)
-        found += [_Placed(inside, len(layers) - 1)] if inside is not None else []
-    return found
-
-
-def _spec_of_envs(env: VecEnv) -> RewardSpec | None:
-    found = env_attributes(env, "reward_spec")
-    if all(spec is None or callable(spec) for spec in found):
-        return None
-    specs = [_as_spec(spec) for spec in found]
-    for index, other in enumerate(specs):
-        if other != specs[0]:
-            raise ValueError(
-                f"All envs must have the same `reward_spec`, found ({specs[0]}) in env 0 and "
-                f"({other}) in env {index}."
-            )
-    return specs[0]
-
-
-def _as_spec(spec: Any) -> RewardSpec:
-    if isinstance(spec, RewardSpec):
-        return spec
-    if isinstance(spec, Mapping):
-        return RewardSpec.from_dict(spec)
-    raise TypeError(
-        "An env's `reward_spec` must be a RewardSpec or a mapping of names to levels, found "
-        f"{spec!r}."
-    )
 
 
 def undecomposed_id(env: VecEnv) -> str | None:
@@ -157,7 +108,7 @@ class ComponentReader:
     def __init__(self, env: VecEnv, spec: RewardSpec):
         self.env, self.spec = env, spec
         self._layers = layers_of(env)
-        self._specs = _specs(env) or [_Placed(spec, len(self._layers) - 1)]
+        self._specs = placed_specs(env) or [Placed(spec, len(self._layers) - 1)]
         tolerances = [*env_attributes(env, "reward_tolerance")]
         tolerances.append(outermost_attribute(env, "reward_tolerance"))
         given = [float(tolerance) for tolerance in tolerances if tolerance is not None]
@@ -267,7 +218,7 @@ class ComponentReader:
             placed is self._specs[-1],
         )
 
-    def _depth_of_writer(self, placed: _Placed) -> int:
+    def _depth_of_writer(self, placed: Placed) -> int:
         """The layer that fills the infos: the one with the spec, but no wrapper of SB3's."""
         layer = type(self._layers[placed.depth])
         is_sb3s = layer.__module__.startswith("stable_baselines3.")
