@@ -1,7 +1,7 @@
-"""Evaluate trained models of rl-zoo3's log folders, and draw their learning curves and a strip of
-frames.
+"""Evaluate trained models of rl-zoo3's log folders beside random actions, and draw their learning
+curves and a strip of frames.
 
-``python examples/show.py logs/gcrppo/sb3_gcr-HumanoidRun-v0_1 logs/gcrppo/sb3_gcr-HumanoidRun-v0_2
+``python examples/show.py logs/gcrppo/sb3_gcr-HumanoidRun-v0_1 logs/ppo/sb3_gcr-HumanoidRun-v0_1
 --out humanoid``
 """
 
@@ -17,9 +17,11 @@ import numpy as np
 import pandas as pd
 import yaml
 from numpy.typing import NDArray
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import load_results
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.type_aliases import PolicyPredictor
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_gcr import GCRPPO, evaluate_components
 from sb3_gcr.envs import BatchedVecEnv
@@ -27,6 +29,11 @@ from sb3_gcr.envs import BatchedVecEnv
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
+#: Curves of both arms.
+REACH = [
+    ("return", "r", 0.0),
+    ("position, fine-grained, of 1.2", "r_end_effector_position_tracking_fine_grained", 0.0),
+]
 #: What the curves show, by task: label, column of Monitor's file, and what one unit of it is per
 #: step.
 CURVES = {
@@ -35,9 +42,40 @@ CURVES = {
         ("throwing, of 4.1", "r_throwing", 0.0),
         ("stability, of 0.5", "r_stability", 0.0),
     ],
+    "Quadcopter": [
+        ("return", "r", 0.0),
+        ("distance_to_goal, of 150", "r_distance_to_goal", 0.0),
+    ],
+    "ReachFranka": REACH,
+    "ReachUR10": REACH,
+    "LocoManipG1": [
+        ("return", "r", 0.0),
+        ("episode length [steps]", "l", 0.0),
+        ("left hand fine-grained, of 28", "r_left_ee_pos_tracking_fine_grained", 0.0),
+    ],
 }
+#: The algorithms by the folder of their runs.
+ALGORITHMS: dict[str, type[PPO]] = {"ppo": PPO, "gcrppo": GCRPPO}
 #: Episodes over which the curves are averaged.
 WINDOW = 500
+
+
+class RandomActions:
+    """A policy that draws its actions evenly from the action space.
+
+    :param env: the env
+    """
+
+    def __init__(self, env: VecEnv):
+        self._space, self._n_envs = env.action_space, env.num_envs
+        self._space.seed(0)
+
+    def predict(self, observation: Any, *_: Any, **__: Any) -> tuple[NDArray[Any], None]:
+        """Actions of all envs, and no state.
+
+        :param observation: not used
+        """
+        return np.array([self._space.sample() for _ in range(self._n_envs)]), None
 
 
 class Run:
@@ -59,6 +97,8 @@ class Run:
             (folder / self.name / "args.yml").read_text()
         )  # written on this machine
         self.seed = int(dict(arguments)["seed"])
+        self.algo = folder.parent.name
+        self.label = f"{self.algo}, seed {self.seed}"
 
     def curve(self, column: str, per_step: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """Steps and a running mean.
@@ -77,7 +117,7 @@ class Run:
             values = values.rolling(WINDOW, 1).mean()
         return episodes["l"].cumsum().to_numpy(), values.to_numpy()
 
-    def load(self, n_envs: int) -> tuple[GCRPPO, VecNormalize]:
+    def load(self, n_envs: int) -> tuple[PPO, VecNormalize]:
         """The model and an env to evaluate it in.
 
         :param n_envs: robots
@@ -85,25 +125,26 @@ class Run:
         env = make_vec_env(self.env_id, n_envs, seed=1000 + self.seed, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
         normalized = VecNormalize.load(str(self.folder / self.name / "vecnormalize.pkl"), env)
         normalized.training = normalized.norm_reward = False
-        return GCRPPO.load(
+        model = ALGORITHMS[self.algo].load(
             self.folder / f"{self.name}.zip", env=normalized, device="cpu"
-        ), normalized
+        )
+        return model, normalized
 
     def evaluate(self, n_episodes: int) -> str:
-        """One line of a table: length, speed where there is one, and the return of each term.
+        """One line of a table: return, length, speed where there is one, the return of each term.
 
         :param n_episodes: deterministic episodes
         """
         model, env = self.load(n_episodes)
-        _, lengths, returns = evaluate_components(
-            model, env, n_episodes, return_episode_rewards=True
-        )  # type: ignore[misc]
-        cells = [f"seed {self.seed}", f"{np.mean(lengths):.0f} steps"]
-        if "progress" in returns:
-            cells.append(f"{np.sum(returns['progress']) / 2 / np.sum(lengths):.2f} m/s")
-        cells += [f"{name} {np.mean(values):.2f}" for name, values in returns.items()]
+        returns, line = episodes(model, env, n_episodes)
+        random_returns, random_line = episodes(RandomActions(env), env, n_episodes)
         env.close()
-        return " | ".join(cells)
+        gain = (np.mean(returns) - np.mean(random_returns)) / np.std(random_returns)
+        return (
+            f"{self.label} | {line}\n"
+            f"random actions | {random_line}\n"
+            f"above them by {gain:.1f} of their standard deviations"
+        )
 
     def frames(self, n_frames: int, every: int, first: int) -> NDArray[np.uint8]:
         """Frames of one deterministic episode, side by side.
@@ -127,6 +168,26 @@ class Run:
         return np.concatenate(shown, axis=1)
 
 
+def episodes(model: PolicyPredictor, env: VecEnv, n_episodes: int) -> tuple[list[float], str]:
+    """Returns, and cells of a table: return, length, speed where there is one, each term.
+
+    :param model: the policy
+    :param env: as many envs as episodes
+    :param n_episodes: deterministic episodes
+    """
+    rewards, lengths, terms = evaluate_components(
+        model, env, n_episodes, return_episode_rewards=True
+    )  # type: ignore[misc]
+    cells = [
+        f"return {np.mean(rewards):.2f} ± {np.std(rewards):.2f}",
+        f"{np.mean(lengths):.0f} steps",
+    ]
+    if "progress" in terms:
+        cells.append(f"{np.sum(terms['progress']) / 2 / np.sum(lengths):.2f} m/s")
+    cells += [f"{name} {np.mean(values):.3g}" for name, values in terms.items()]
+    return rewards, " | ".join(cells)
+
+
 def draw_curves(runs: list[Run], path: Path) -> None:
     """One panel per curve of the task, one line per run.
 
@@ -140,7 +201,7 @@ def draw_curves(runs: list[Run], path: Path) -> None:
     for panel, (label, column, per_step) in zip(panels, curves, strict=True):
         for run in runs:
             steps, values = run.curve(column, per_step)
-            panel.plot(steps / 1e6, values, label=f"seed {run.seed}", linewidth=1)
+            panel.plot(steps / 1e6, values, label=run.label, linewidth=1)
         panel.set(xlabel="million steps", ylabel=label)
         panel.grid(alpha=0.3)
     panels[0].legend()
