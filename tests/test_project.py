@@ -19,7 +19,9 @@ ROOT = Path(__file__).parents[1]
 ARROWS = {
     "advantages": set(),
     "angles": set(),
+    "arguments": {"checks"},
     "checks": set(),
+    "diagnosis": set(),
     "losses": {"advantages"},
     "fast_gcr": {"angles"},
     "guaranteed": {"angles"},
@@ -75,6 +77,7 @@ ARROWS = {
     "multi_head_ppo": {
         "advantages",
         "buffers",
+        "diagnosis",
         "logs.shown",
         "policies",
         "rewards.layers",
@@ -83,6 +86,7 @@ ARROWS = {
         "rewards.spec",
     },
     "gcrppo": {
+        "arguments",
         "checks",
         "gradients.__init__",
         "gradients.by_hand",
