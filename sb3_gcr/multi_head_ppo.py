@@ -163,7 +163,8 @@ class MultiHeadPPO(PPO):
             raise TypeError(
                 "Parameter `env` must be a Gymnasium env, its id or a VecEnv of SB3, found a "
                 f"Gymnasium vector env, {type(env).__name__}. Use SB3's `make_vec_env(id, "
-                "n_envs)`, with `vec_env_cls=sb3_gcr.envs.BatchedVecEnv` for the envs of this package."
+                "n_envs)`; for the envs of this package with "
+                "`vec_env_cls=sb3_gcr.envs.BatchedVecEnv`."
             )
         return PPO._wrap_env(env, verbose, monitor_wrapper)
 
