@@ -62,7 +62,13 @@ class VectorRolloutBuffer(RolloutBuffer):
         :param episode_start: shape (N,)
         :param value: V(s_t), shape (N, K)
         :param log_prob: log π(a_t|s_t), shape (N,)
+        :raises ValueError: for values of another shape, which would be repeated for all components
         """
+        if value.shape[1:] != (self.n_components,):
+            raise ValueError(
+                f"The policy's values must have shape (N, {self.n_components}), one per reward "
+                f"component, found {tuple(value.shape)}."
+            )
         # SB3 flattens values, and a single number broadcasts; the values themselves are stored
         # below.
         super().add(obs, action, reward, episode_start, value[:1, :1], log_prob)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ def check_number(
     above: bool = False,
     integer: bool = False,
     optional: bool = False,
+    schedule: bool = False,
 ) -> None:
     """Refuse what is no number, or lies outside its range.
 
@@ -28,14 +29,18 @@ def check_number(
     :param above: whether ``low`` itself is not valid
     :param integer: whether it must be an integer
     :param optional: whether None is valid
+    :param schedule: whether a function, as SB3's schedules are, is valid; it is not called
     :raises TypeError: for text and other things that are no number
     :raises ValueError: for a number outside the range, NaN included
     """
-    if value is None and optional:
+    if (value is None and optional) or (schedule and callable(value)):
         return
-    kind = "an integer" if integer else "a number"
-    expected = f"{kind}{_range(low, high, above)}{' or None' if optional else ''}"
-    message = f"Parameter `{name}` must be {expected}, found {value!r}."
+    choices = [f"{'an integer' if integer else 'a number'}{_range(low, high, above)}"]
+    if schedule:
+        choices.append("a schedule")
+    if optional:
+        choices.append("None")
+    message = f"Parameter `{name}` must be {_or(choices)}, found {value!r}."
     if isinstance(value, str):
         raise TypeError(f"{message}{text_hint(value)}")
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
@@ -60,8 +65,24 @@ def check_choice(name: str, value: Any, choices: Collection[str], optional: bool
     listed = [repr(choice) for choice in choices]
     if optional:
         listed.append("None")
-    expected = f"{', '.join(listed[:-1])} or {listed[-1]}"
-    raise ValueError(f"Parameter `{name}` must be {expected}, found {value!r}.")
+    raise ValueError(f"Parameter `{name}` must be {_or(listed)}, found {value!r}.")
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Refuse what is neither True nor False, such as the text "False", which counts as true.
+
+    :param name: of the parameter
+    :param value: what was given
+    :raises TypeError: says what was found
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"Parameter `{name}` must be True or False, found {value!r}.")
+
+
+def _or(choices: Sequence[str]) -> str:
+    if len(choices) == 1:
+        return choices[0]
+    return f"{', '.join(choices[:-1])} or {choices[-1]}"
 
 
 def _range(low: float, high: float, above: bool) -> str:

@@ -17,7 +17,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import update_learning_rate
 
-from sb3_gcr.checks import check_choice, check_number
+from sb3_gcr.arguments import check_arguments
+from sb3_gcr.checks import check_choice
 from sb3_gcr.gradients import METHODS, ActorCritic, choose
 from sb3_gcr.gradients.by_hand import ByHand
 from sb3_gcr.gradients.memory import Array, Weights
@@ -120,6 +121,7 @@ class GCRPPO(Saving, MultiHeadPPO):
         gramian_samples: int | None = None,
         surrogate_clipping: str = "joint",
     ):
+        check_arguments(locals())
         self.resolver = resolver
         self.resolver_kwargs = resolver_kwargs
         self.advantage_scope = advantage_scope
@@ -173,9 +175,7 @@ class GCRPPO(Saving, MultiHeadPPO):
         check_choice("advantage_scope", self.advantage_scope, SCOPES, optional=True)
         check_choice("gramian_method", self.gramian_method, METHODS)
         check_choice("surrogate_clipping", self.surrogate_clipping, CLIPPINGS)
-        check_number("kappa_max", self.kappa_max, 0, above=True)
-        check_number("gramian_samples", self.gramian_samples, 1, integer=True, optional=True)
-        check_number("desired_kl", self.desired_kl, 0, above=True, optional=True)
+        check_arguments(vars(self))  # of a loaded model, too
 
     @property
     def _is_scalar_ppo(self) -> bool:
@@ -210,13 +210,18 @@ class GCRPPO(Saving, MultiHeadPPO):
     def train(self) -> None:
         """Update the policy from the current rollout: the paper's method, minibatch by minibatch.
 
-        :raises ValueError: if a gradient is not finite, before it reaches the weights
+        :raises ValueError: if a gradient is not finite, before it reaches the weights; if the
+            policy can give no distribution of actions
         """
         refuse_infinite_rollout(self.rollout_buffer, self.num_timesteps)
-        if self._is_scalar_ppo:
+        with self._in_plain_words():
+            if not self._is_scalar_ppo:
+                self._train_components()
+                return
             with th.enable_grad():
                 super().train()
-            return
+
+    def _train_components(self) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         clip = self._clip()

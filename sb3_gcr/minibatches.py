@@ -96,9 +96,10 @@ def refuse_infinite_rollout(buffer: RolloutBuffer, timestep: int) -> None:
     :raises ValueError: names what is not finite
     """
     for name in ("log_probs", "values", "advantages"):
-        if not np.isfinite(getattr(buffer, name)).all():
+        bad = np.argwhere(~np.isfinite(getattr(buffer, name)))
+        if len(bad):
             raise ValueError(
-                f"The rollout's `{name}` must be finite, found NaN or infinity before the update "
-                f"at timestep {timestep}. The policy is as it was; check rewards and observations, "
-                "e.g. with VecCheckNan."
+                f"The rollout's `{name}` must be finite, found NaN or infinity for env index "
+                f"{bad[-1][1]} before the update at timestep {timestep}. The policy is as it was; "
+                "check rewards and observations, e.g. with VecCheckNan."
             )

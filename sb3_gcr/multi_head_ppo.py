@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -21,8 +23,15 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gcr.advantages import bootstrap_truncations
 from sb3_gcr.buffers import VectorDictRolloutBuffer, VectorRolloutBuffer
+from sb3_gcr.diagnosis import in_plain_words, why_no_actions
 from sb3_gcr.logs.shown import component_table
-from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiHeadActorCriticPolicy, MultiInputPolicy
+from sb3_gcr.policies import (
+    CnnPolicy,
+    MlpPolicy,
+    MultiHeadActorCriticPolicy,
+    MultiInputPolicy,
+    check_value_heads,
+)
 from sb3_gcr.rewards.layers import outermost_attribute
 from sb3_gcr.rewards.reading import (
     ComponentReader,
@@ -97,6 +106,7 @@ class MultiHeadPPO(PPO):
         self._choose_vector_classes()
         super()._setup_model()
         self.__dict__.update(given)  # what a model saves is what its constructor was given
+        check_value_heads(self.policy, self.n_components)
 
     def _adopt_reward_spec(self) -> None:
         """Take over the env's spec, or check it against the one that a loaded model was made
@@ -147,6 +157,17 @@ class MultiHeadPPO(PPO):
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = MlpPolicy.__name__) -> None:
         super()._maybe_recommend_cpu(mlp_class_name)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        if isinstance(env, gym.vector.VectorEnv):
+            raise TypeError(
+                "Parameter `env` must be a Gymnasium env, its id or a VecEnv of SB3, found a "
+                f"Gymnasium vector env, {type(env).__name__}. Use SB3's `make_vec_env(id, "
+                "n_envs)`; for the envs of this package with "
+                "`vec_env_cls=sb3_gcr.envs.BatchedVecEnv`."
+            )
+        return PPO._wrap_env(env, verbose, monitor_wrapper)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """SB3's ``set_env``; the reward components must be those of the model, their order may
@@ -210,10 +231,28 @@ class MultiHeadPPO(PPO):
         :param n_rollout_steps: number of steps per env
         :return: False if the callback stopped the rollout
         :raises ValueError: if the components of a step are missing, not finite, or do not sum to
-            the reward
+            the reward; if the policy can give no actions, since an observation or a parameter is
+            not finite or a standard deviation is 0
         """
-        if self._is_scalar_ppo:
-            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        collect = super().collect_rollouts if self._is_scalar_ppo else self._collect_components
+        with self._in_plain_words():
+            return collect(env, callback, rollout_buffer, n_rollout_steps)
+
+    @contextmanager
+    def _in_plain_words(self) -> Iterator[None]:
+        """Explain why the policy could give no actions, if so."""
+        with in_plain_words(
+            lambda: why_no_actions(self.policy, self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
+        ):
+            yield
+
+    def _collect_components(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
         assert self._last_obs is not None, "No previous observation was provided"
         self.policy.set_training_mode(False)
         rollout_buffer.reset()

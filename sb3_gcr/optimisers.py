@@ -56,8 +56,8 @@ class FusedAdam(th.optim.Adam):
         arguments = self._arguments
         if arguments is None or closure is not None or not self._are_current(arguments):
             return self._step_of_pytorch(closure)
-        gradients = [parameter.grad for parameter in arguments.parameters]
-        if any(gradient is None for gradient in gradients):
+        gradients = [p.grad for p in arguments.parameters if p.grad is not None]
+        if len(gradients) < len(arguments.parameters):
             return self._step_of_pytorch(closure)
         group = self.param_groups[0]
         arguments.all_steps.add_(1)

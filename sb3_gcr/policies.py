@@ -5,6 +5,9 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import numpy as np
+import torch as th
+from gymnasium.vector.utils import create_empty_array
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
     ActorCriticPolicy,
@@ -14,6 +17,31 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from sb3_gcr.optimisers import FusedAdam
+
+
+def check_value_heads(policy: ActorCriticPolicy, n_components: int) -> None:
+    """Refuse a critic that does not give one value per reward component.
+
+    A single one would be taken for the value of every component without a word.
+
+    :param policy: its training mode and all generators stay as they are
+    :param n_components: number K of reward components
+    :raises ValueError: names the shape that was found
+    """
+    observations: Any = create_empty_array(policy.observation_space, 2, np.zeros)
+    was_training = policy.training
+    policy.set_training_mode(False)
+    with th.random.fork_rng(devices=[]), th.no_grad():
+        values = policy.predict_values(policy.obs_to_tensor(observations)[0])
+    policy.set_training_mode(was_training)
+    if values.shape == (2, n_components):
+        return
+    found = ", ".join(["B", *map(str, values.shape[1:])])
+    raise ValueError(
+        "Parameter `policy` must have a critic with one value per reward component, shape "
+        f"(B, {n_components}), found shape ({found}{',' if values.ndim == 1 else ''}). Give the "
+        "last layer `self.n_components` outputs."
+    )
 
 
 class MultiHeadActorCriticPolicy(ActorCriticPolicy):

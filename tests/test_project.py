@@ -19,7 +19,9 @@ ROOT = Path(__file__).parents[1]
 ARROWS = {
     "advantages": set(),
     "angles": set(),
+    "arguments": {"checks"},
     "checks": set(),
+    "diagnosis": set(),
     "losses": {"advantages"},
     "fast_gcr": {"angles"},
     "guaranteed": {"angles"},
@@ -54,8 +56,9 @@ ARROWS = {
         "gradients.fitting",
         "gradients.memory",
     },
-    "gradients.by_autograd": {"gradients.memory"},
-    "gradients.fitting": {"gradients.layers"},
+    "gradients.by_autograd": {"gradients.hooks", "gradients.memory"},
+    "gradients.fitting": {"gradients.hooks", "gradients.layers"},
+    "gradients.hooks": set(),
     "gradients.gramian": {"gradients.memory"},
     "gradients.layers": {"gradients.memory"},
     "gradients.heads": {"gradients.memory"},
@@ -74,6 +77,7 @@ ARROWS = {
     "multi_head_ppo": {
         "advantages",
         "buffers",
+        "diagnosis",
         "logs.shown",
         "policies",
         "rewards.layers",
@@ -82,6 +86,7 @@ ARROWS = {
         "rewards.spec",
     },
     "gcrppo": {
+        "arguments",
         "checks",
         "gradients.__init__",
         "gradients.by_hand",

@@ -107,8 +107,7 @@ class ByAutograd:
         :param value_gradients: of the loss by the values, shape (B, K)
         :param ent_coef: weight of the entropy loss
         """
-        # Of frozen and forgotten parameters, too: an optimiser steps whatever has a gradient.
-        self.policy.zero_grad()
+        # As PPO: of frozen parameters, too, since an optimiser steps whatever has a gradient.
         self.policy.optimizer.zero_grad()
         w = th.as_tensor(weights, dtype=cotangents.dtype, device=cotangents.device)
         outputs = [self._log_prob, self._values]
@@ -121,4 +120,4 @@ class ByAutograd:
 
     def clip_gradients(self, max_norm: float) -> float:
         """Scale all gradients to a joint norm of at most ``max_norm``; return the norm before."""
-        return th.nn.utils.clip_grad_norm_(self._parameters, max_norm).item()
+        return th.nn.utils.clip_grad_norm_(self.policy.parameters(), max_norm).item()

@@ -116,7 +116,9 @@ def _hides_a_method(part: object) -> bool:
 
 
 def _trains_each_parameter_once(policy: ActorCriticPolicy) -> bool:
-    """Whether each parameter belongs to one layer and is trained, and the optimiser has no more."""
+    """Whether each parameter belongs to one layer and is trained, and the optimiser steps all of
+    them and no others.
+    """
     expected: list[object] = []
     for layer in (*actor_modules(policy)[::2], *critic_modules(policy)[::2]):
         expected += [layer.weight, layer.bias]
@@ -132,7 +134,7 @@ def _trains_each_parameter_once(policy: ActorCriticPolicy) -> bool:
         return False
     groups = policy.optimizer.param_groups
     stepped = {id(parameter) for group in groups for parameter in group["params"]}
-    return stepped <= known and all(_is_common(parameter) for parameter in found)
+    return stepped == known and all(_is_common(parameter) for parameter in found)
 
 
 def _is_common(parameter: nn.Parameter) -> bool:
