@@ -283,7 +283,7 @@ def test_the_tables_of_the_page(written: Path) -> None:
     # 60 s and 30 s for 500,000 steps
     (_, _, runtime) = page.table("method", "collection [s]")
     assert (runtime["collection [s]"], runtime["update [s]"]) == ("12", "6")
-    (row,) = page.table("task", "SPC [%]", "the paper's task")
+    (row,) = page.table("task", "SPC [%]", "P(improvement)")
     # 200 (224 - 200) / (224 + 200)
     assert row["SPC [%]"] == "11.32"
     assert (row["PPO, final"], row["GCRPPO, final"]) == ("200 ± 2.83", "224 ± 2.83")

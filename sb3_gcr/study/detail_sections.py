@@ -48,7 +48,8 @@ def detail_sections(study: Collected, data: Frames, found: Conclusions) -> list[
         blocks += curve_blocks(part, found, f"{index}_")
         if in_full:
             blocks += term_blocks(part, found, f"{index}_")
-        blocks += conflict_blocks(part, results, found, f"{index}_")
+        conflicts = conflict_blocks(part, results, found, f"{index}_")
+        blocks += conflicts if in_full else conflicts[:2]
         if in_full:
             blocks += runtime_blocks(part, found, f"{index}_")
     if len(names) > MOST_DETAILED:

@@ -65,6 +65,8 @@ class Code(NamedTuple):
     text: str
 
 
+#: Letters of a cell that stays on one line.
+LONG = 32
 #: Where the pictures of the Markdown lie, beside it.
 FOLDER = "pictures"
 
@@ -98,7 +100,7 @@ th, td { padding: .3rem .7rem .3rem 0; text-align: right; vertical-align: top;
 td { white-space: nowrap; }
 th { font-weight: 600; vertical-align: bottom; }
 .word { text-align: left; }
-td.word { white-space: normal; min-width: 5.5rem; max-width: 22rem; }
+td.long { white-space: normal; min-width: 11rem; max-width: 22rem; }
 .pictures { display: grid; gap: 1.4rem 2rem; margin: 1rem 0;
   grid-template-columns: repeat(auto-fill, minmax(min(100%, 20rem), 1fr)); }
 .pictures.one { grid-template-columns: minmax(0, 46rem); }
@@ -181,7 +183,7 @@ def _words(text: str) -> str:
 
 def _html_table(table: Table) -> str:
     def row(cells: Sequence[str], tag: str) -> str:
-        marks = [' class="word"' if i < table.words else "" for i in range(len(cells))]
+        marks = [_mark(cell) if i < table.words else "" for i, cell in enumerate(cells)]
         return "".join(
             f"<{tag}{mark}>{_words(cell)}</{tag}>" for cell, mark in zip(cells, marks, strict=True)
         )
@@ -193,6 +195,11 @@ def _html_table(table: Table) -> str:
     if table.folded:
         return f"<details><summary>{_words(table.caption)}</summary>{inner}</details>"
     return caption + inner
+
+
+def _mark(cell: str) -> str:
+    """The class of a cell of words; a long one has several lines."""
+    return ' class="word long"' if len(cell) > LONG else ' class="word"'
 
 
 def _markdown(block: Block) -> str:

@@ -12,12 +12,15 @@ from sb3_gcr.study.collected import Collected
 from sb3_gcr.study.conclusions import Conclusions
 from sb3_gcr.study.frames import Frames, short
 from sb3_gcr.study.page import Block, Heading, Picture, Pictures, Table, Text
-from sb3_gcr.study.sections import DASH
+from sb3_gcr.study.sections import DASH, without_empty
 from sb3_gcr.study.store import Record
 from sb3_gcr.study.words import called, number, p_value, percent
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+#: A table with more rows opens on demand.
+MOST_ROWS = 20
 
 
 def paper_section(study: Collected, data: Frames, found: Conclusions) -> list[Block]:
@@ -105,7 +108,7 @@ def table_1_blocks(table: pd.DataFrame, found: Conclusions) -> list[Block]:
         "from its means and deviations."
     )
     return [
-        Table(head, rows, note),
+        without_empty(Table(head, rows, note, folded=len(rows) > MOST_ROWS)),
         Table(paper_head, paper_rows, paper_note, folded=True),
     ]
 
@@ -120,9 +123,9 @@ def _table_1_row(row: Any) -> list[str]:
     return [
         short(row.configuration),
         str(row.n),
-        f"{number(row.mean_baseline, 4)} ± {number(row.sd_baseline, 3)}",
+        _spread(row.mean_baseline, row.sd_baseline),
         number(row.max_baseline, 4),
-        f"{number(row.mean_method, 4)} ± {number(row.sd_method, 3)}",
+        _spread(row.mean_method, row.sd_method),
         number(row.max_method, 4),
         f"{row.spc:.2f}{'*' if row.signs_differ else ''}",
         interval,
@@ -139,11 +142,15 @@ def _table_1_row(row: Any) -> list[str]:
     ]
 
 
+def _spread(mean: float, sd: float) -> str:
+    return number(mean, 4) if math.isnan(sd) else f"{number(mean, 4)} ± {number(sd)}"
+
+
 def _paper_row(row: Any) -> list[str]:
     return [
         row.task,
-        f"{number(row.mean_baseline, 4)} ± {number(row.sd_baseline)}",
-        f"{number(row.mean_method, 4)} ± {number(row.sd_method)}",
+        _spread(row.mean_baseline, row.sd_baseline),
+        _spread(row.mean_method, row.sd_method),
         f"{row.spc:.2f}",
         f"{row.printed_spc:.2f}",
         f"{percent(row.low)} to {percent(row.high)}",

@@ -83,8 +83,11 @@ def blocks(study: Collected, data: Frames, found: Conclusions, command: str) -> 
         return [*parts, Text("No cell has finished yet: there is nothing to show.")]
     parts += sections.contrast_section(found)
     parts += sections.method_section(data, found)
-    parts += detail_sections.detail_sections(study, data, found)
-    parts += paper_sections.paper_section(study, data, found)
+    details = detail_sections.detail_sections(study, data, found)
+    papers = paper_sections.paper_section(study, data, found)
+    # With many configurations what they come to together is what is looked for first.
+    several = data.cells["configuration"].nunique() > detail_sections.MOST_IN_FULL
+    parts += papers + details if several else details + papers
     parts += sections.cell_section(data)
     return [*parts, Heading("Where the numbers come from"), Text(_source(study), "note")]
 

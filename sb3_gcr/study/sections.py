@@ -148,6 +148,18 @@ def _by_configuration(found: Conclusions) -> list[Picture]:
     return [Picture("differences_by_configuration", figure, caption)]
 
 
+def without_empty(table: Table) -> Table:
+    """The table without the columns of numbers that have none."""
+    kept = [
+        i
+        for i in range(len(table.head))
+        if i < table.words or any(row[i] != DASH for row in table.rows)
+    ]
+    return table._replace(
+        head=[table.head[i] for i in kept], rows=[[row[i] for i in kept] for row in table.rows]
+    )
+
+
 def without_first(table: Table) -> Table:
     """The table without its first column, which says the same in every row."""
     rows = [row[1:] for row in table.rows]
