@@ -61,16 +61,23 @@ def _answer(env: gym.Env[Any, Any], env_id: str, samples: Samples) -> Answer:
     known = _known(env_id, samples)
     if known is not None:
         return known
+    copies: list[str] = []
     for group, names in _candidates(samples):
         answer = _by_told_weights(group, samples) or _explain(group, names, samples)
-        if answer is not None:
+        if answer is not None and not _is_copy(answer):
             return answer
+        copies += answer.weights if answer is not None else []
     for group, names in _candidates(samples):
         grown = _increases(group, samples.starts)
         answer = _explain(grown, names, samples)
-        if answer is not None:
+        if answer is not None and not _is_copy(answer):
             return answer._replace(group=group, cumulative=True)
-    return Answer("nothing", explained=_best_share(samples))
+    return Answer("nothing", explained=_best_share(samples), copies=tuple(dict.fromkeys(copies)))
+
+
+def _is_copy(answer: Answer) -> bool:
+    """Whether it is one number that is the reward, which takes nothing apart."""
+    return len(answer.weights) == 1 and not answer.constant
 
 
 def _own_spec(env: gym.Env[Any, Any]) -> RewardSpec | None:
@@ -102,7 +109,7 @@ def _candidates(samples: Samples) -> Iterator[tuple[Group, list[str]]]:
     """Places and names to look at: first what sounds like terms, then everything in one place."""
     ordered = sorted(samples.groups, key=lambda group: not group.reward_like)
     for group in ordered:
-        if group.reward_like and group.kind != "vector":
+        if group.reward_like:
             yield group, group.reward_like
     for group in ordered:
         yield group, list(group.names)
@@ -147,14 +154,15 @@ def _explain(group: Group, names: list[str], samples: Samples) -> Answer | None:
         return None
     if group.kind == "vector":
         return _explain_vector(group, samples)
-    for chosen in (names, _without_sums(group, names, rewards)):
-        columns = group.take(chosen)
-        if chosen and all_add_up(columns, rewards):
-            return Answer("sum", group, dict.fromkeys(chosen, 1.0))
     kept = _without_sums(group, names, rewards)
+    for chosen in (names, kept):
+        adds_up = chosen and all_add_up(group.take(chosen), rewards)
+        if adds_up and not _has_copies(group, chosen):
+            return Answer("sum", group, dict.fromkeys(chosen, 1.0))
     if len(rewards) < 2 * len(kept) + 10:
         return None
-    varying = [kept[index] for index in independent_columns(group.take(kept))]
+    likely = sorted(kept, key=lambda name: name not in group.reward_like)
+    varying = [likely[index] for index in independent_columns(group.take(likely))]
     if not varying:
         return None
     fit = fit_sum(group.take(varying), rewards)
@@ -204,11 +212,7 @@ def _explain_vector(group: Group, samples: Samples) -> Answer | None:
 
 def _without_sums(group: Group, names: list[str], rewards: Array) -> list[str]:
     """The names without copies of the reward, copies of others, and sums of others."""
-    kept = [
-        name
-        for name in names
-        if len(names) == 1 or not _is_proportional(group.take([name])[:, 0], rewards)
-    ]
+    kept = names if len(names) == 1 else _without_copies(group, names, rewards)
     columns = {name: group.take([name])[:, 0] for name in kept}
     totals = set()
     for name in kept:
@@ -216,6 +220,21 @@ def _without_sums(group: Group, names: list[str], rewards: Array) -> list[str]:
         if len(others) >= 2 and columns[name].any() and _is_sum(group, name, others):
             totals.add(name)
     return [name for name in kept if name not in totals]
+
+
+def _without_copies(group: Group, names: list[str], rewards: Array) -> list[str]:
+    """The names without those of the reward itself, or of it times a factor."""
+    return [name for name in names if not _is_proportional(group.take([name])[:, 0], rewards)]
+
+
+def _has_copies(group: Group, names: list[str]) -> bool:
+    """Whether two numbers differ by a factor only, so that one may be no term."""
+    columns = [group.take([name])[:, 0] for name in names]
+    return any(
+        _is_proportional(column, other)
+        for index, column in enumerate(columns)
+        for other in columns[:index]
+    )
 
 
 def _is_sum(group: Group, name: str, others: list[str]) -> bool:
@@ -293,7 +312,8 @@ def _best_share(samples: Samples) -> float:
     """The largest share of the reward's variation that the numbers of one place explain."""
     best = 0.0
     total = float(samples.rewards.var())
-    for group, names in _candidates(samples):
+    for group, candidates in _candidates(samples):
+        names = _without_copies(group, candidates, samples.rewards)
         varying = [names[index] for index in independent_columns(group.take(names))]
         if not total or not varying or len(samples.rewards) < 2 * len(varying) + 10:
             continue

@@ -48,7 +48,8 @@ class ToldWeights:
         if self.factor == 1:
             return f"lambda env: {told}"
         return (
-            f"lambda env: {{name: {self.factor!r} * {told}[name] for name in {list(self.names)}}}"
+            f"lambda env: {{name: {self.factor:.12g} * {told}[name] for name in "
+            f"{list(self.names)}}}"
         )
 
 
@@ -86,6 +87,7 @@ class Answer(NamedTuple):
     :param cumulative: whether the terms are running totals
     :param tolerance: what the sum check must be told
     :param options: more of ``RewardDecomposition``'s
+    :param copies: names of numbers that are the reward itself
     :param explained: the best share of the reward's variation, where nothing adds up
     """
 
@@ -99,6 +101,7 @@ class Answer(NamedTuple):
     cumulative: bool = False
     tolerance: float | None = None
     options: dict[str, Any] = {}  # noqa: RUF012 never changed
+    copies: tuple[str, ...] = ()
     explained: float = 0.0
 
 
@@ -161,7 +164,8 @@ class FoundComponents:
             found["weights"] = answer.told
         elif set(answer.weights.values()) != {1.0}:
             values = set(answer.weights.values())
-            found["weights"] = values.pop() if len(values) == 1 else self.weights
+            by_name = {name: _short(weight) for name, weight in answer.weights.items()}
+            found["weights"] = _short(values.pop()) if len(values) == 1 else by_name
         if answer.constant:
             found["residual"] = {CONSTANT: "regulariser"}
         if answer.cumulative:
@@ -211,9 +215,12 @@ class FoundComponents:
                 '{"first": "task", ...})` names them in order.'
             )
         if answer.kind == "nothing":
+            copies = ", ".join(answer.copies)
+            but = f", but for copies of it: {copies}" if copies else ""
+            share = min(answer.explained, 0.999)
             return (
-                f"No numbers in info add up to the reward in {n_steps} random steps; the best "
-                f"explain {answer.explained:.0%} of its variation. The terms may be missing, "
+                f"No numbers in info add up to the reward in {n_steps} random steps{but}; the best "
+                f"explain {share:.1%} of its variation. The terms may be missing, "
                 "changed by a condition, a product or a clip, or be local variables: return them "
                 "with `terms=`, or record the methods that compute them with `calls=`."
             )
@@ -277,10 +284,16 @@ class FoundComponents:
         return "\n".join(lines)
 
     def __str__(self) -> str:
-        parts = [self.env_id, self.table, self.sentence, self.line]
+        table = "" if self.answer.kind == "reported" else self.table
+        parts = [self.env_id, table, self.sentence, self.line]
         return "\n\n".join(part for part in parts if part)
 
     __repr__ = __str__
+
+
+def _short(weight: float) -> float:
+    """An integer where it is one, to be written so."""
+    return int(weight) if weight == int(weight) else weight
 
 
 def _attribute(answer: Answer) -> str:

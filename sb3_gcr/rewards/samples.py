@@ -123,8 +123,8 @@ def _numbers(
 ) -> Iterator[tuple[tuple[str, str, str], float]]:
     """All numbers of a step by kind, path and name."""
     yield from _flatten("info", "", info)
-    for name, value in vars(env.unwrapped).items():
-        if isinstance(value, Mapping) and REWARD_WORDS.search(name):
+    for name, value in _dictionaries(env).items():
+        if REWARD_WORDS.search(name):
             yield from _flatten("attribute", name, value)
 
 
@@ -147,14 +147,25 @@ def _flatten(
                 yield ("vector", inner, f"{key}_{index}"), entry
 
 
+def _dictionaries(env: gym.Env[Any, Any]) -> dict[str, Mapping[Any, Any]]:
+    """Attributes of the env and of its classes that are dictionaries; no property is called."""
+    attributes: dict[str, Any] = {}
+    for kind in reversed(type(env.unwrapped).__mro__):
+        attributes |= vars(kind)
+    attributes |= vars(env.unwrapped)
+    return {
+        name: value
+        for name, value in attributes.items()
+        if isinstance(value, Mapping) and not name.startswith("__")
+    }
+
+
 def _told_weights(env: gym.Env[Any, Any]) -> dict[str, dict[str, float]]:
     """Attributes of the env that are dictionaries of numbers, those with the likeliest names
     first.
     """
     found = {}
-    for name, value in vars(env.unwrapped).items():
-        if not isinstance(value, Mapping):
-            continue
+    for name, value in _dictionaries(env).items():
         numbers = {
             str(key): float(number)
             for key, number in value.items()
