@@ -13,6 +13,7 @@ from sb3_gcr.gcrppo import GCRPPO
 from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gcr.resolvers import RESOLVERS
 from sb3_gcr.rewards.decomposition import RewardDecomposition
+from sb3_gcr.rewards.finding import find_components
 from sb3_gcr.rewards.spec import RewardSpec
 from sb3_gcr.saving.checkpoints import latest_checkpoint
 
@@ -29,5 +30,6 @@ __all__ = [
     "VectorRolloutBuffer",
     "envs",
     "evaluate_components",
+    "find_components",
     "latest_checkpoint",
 ]

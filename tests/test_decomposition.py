@@ -547,3 +547,139 @@ def test_every_failure_arrives_as_a_sentence(vec_env_cls: Any) -> None:
     with pytest.raises(ValueError, match=exactly(message)):
         model.learn(8)
     env.close()
+
+
+# ------------------------------------------------------------ other places
+
+
+def test_terms_under_a_key_or_a_path() -> None:
+    info = {"log": {"rewards": {"near": 1.0, "effort": -0.25}}, "near": 9.0}
+    names = {"near": 0, "effort": 1}
+    assert report(info, 0.75, names, under="log/rewards") == [1.0, -0.25]
+    assert report(info, 0.75, {"near": 0, "energy": 1}, under="log/rewards") == (
+        "Reward component 'energy' is missing: parameter `components` must name keys of "
+        "`info[\"log/rewards\"]`, found only ['effort', 'near']."
+    )
+    assert report(info, 0.75, names, under="near") == (
+        '`info["near"]` must be a dictionary of terms by name, found 9.0.'
+    )
+    assert report(info, 0.75, names, under="rewards") == (
+        'Parameter `under` must be a key of `info` with a dictionary of terms, found no "rewards" '
+        "among ['log', 'near']."
+    )
+
+
+def test_running_totals() -> None:
+    """1, 3 and 6 in total are 1, 2 and 3 a step, and from the start again after a reset."""
+    infos = [{"a": 1.0, "b": -1.0}, {"a": 3.0, "b": -2.0}, {"a": 6.0, "b": -3.0}]
+    env = RewardDecomposition(Terms(infos, [0.0, 1.0, 2.0]), {"a": 0, "b": 1}, cumulative=True)
+    for _ in range(2):
+        env.reset()
+        env.unwrapped.t = 0  # type: ignore[attr-defined]
+        rows = [env.step(np.zeros(1))[4]["reward_components"].tolist() for _ in range(3)]
+        assert rows == [[1, -1], [2, -1], [3, -1]]
+
+
+def test_running_totals_that_do_not_start_with_0() -> None:
+    class Starting(Terms):
+        def reset(self, **kwargs: Any) -> Any:
+            return super().reset(**kwargs)[0], {"a": 5.0}
+
+    env = RewardDecomposition(Starting([{"a": 6.0}], [1.0]), {"a": 0}, cumulative=True)
+    env.reset()
+    assert env.step(np.zeros(1))[4]["reward_components"].tolist() == [1.0]
+
+
+def test_running_totals_that_nobody_announced() -> None:
+    infos = [{"a": 2.0, "b": -1.0}, {"a": 5.0, "b": -2.0}]
+    env = RewardDecomposition(Terms(infos, [1.0, 2.0]), {"a": 0, "b": 1})
+    env.reset()
+    env.step(np.zeros(1))
+    assert env.step(np.zeros(1))[4]["reward_components_error"] == (
+        "The terms are running totals: the reward is by how much they have grown since the step "
+        "before. Give `RewardDecomposition(cumulative=True)`."
+    )
+
+
+def test_terms_of_a_function() -> None:
+    names = {"near": 0, "effort": 1}
+    info = {"x": 2.0}
+
+    def terms(env: gym.Env[Any, Any], info: dict[str, Any]) -> dict[str, float]:
+        return {"near": info["x"], "effort": -float(env.unwrapped.t)}  # type: ignore[attr-defined]
+
+    assert report(info, 1.0, names, terms=terms) == [2.0, -1.0]
+    assert report(info, 1.0, names, terms=lambda env, info: info["y"]) == (
+        "The reward components cannot be read: KeyError: 'y'."
+    )
+    assert report(info, 1.0, names, terms=lambda env, info: 3) == (
+        "`terms(env, info)` must be a dictionary of terms by name, found 3."
+    )
+
+
+class Calling(Terms):
+    """Its terms are what methods return; one is called twice a step, one only sometimes."""
+
+    class Part:
+        def bonus(self) -> float:
+            return 10.0
+
+    def __init__(self) -> None:
+        super().__init__([{}], [0.0])
+        self.part = self.Part()
+
+    def near(self, x: float) -> float:
+        return x
+
+    def step(self, action: Any) -> Any:
+        observation, _, terminated, truncated, info = super().step(action)
+        reward = self.near(1.0) + self.near(0.5)
+        if self.t == 2:
+            reward += self.part.bonus()
+        return observation, reward, terminated, truncated, info
+
+
+def test_terms_that_methods_return() -> None:
+    calls = {"near": "near", "bonus": "part.bonus"}
+    env = RewardDecomposition(Calling(), {"near": 0, "bonus": 0}, calls=calls)
+    env.reset()
+    env.unwrapped.near(99.0)  # type: ignore[attr-defined]
+    rows = [env.step(np.zeros(1))[4]["reward_components"].tolist() for _ in range(3)]
+    assert rows == [[1.5, 0], [1.5, 10], [1.5, 0]]
+    env = RewardDecomposition(Calling(), {"near": 0}, residual="bonus", calls=["near"])
+    env.reset()
+    assert env.step(np.zeros(1))[4]["reward_components"].tolist() == [1.5, 0]
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        (
+            {"calls": ["nera"]},
+            ValueError,
+            "Parameter `calls` must name methods of Calling, found 'nera'. Did you mean one of "
+            "['near', …",
+        ),
+        (
+            {"calls": {"near": "part.nothing"}},
+            ValueError,
+            "Parameter `calls` must name methods of Calling, found 'part.nothing'.…",
+        ),
+        (
+            {"calls": "near"},
+            TypeError,
+            "Parameter `calls` must be a list of method names, or such names by component, found "
+            "'near'.",
+        ),
+        (
+            {"calls": ["near"], "under": "rewards"},
+            ValueError,
+            "Parameters `under`, `terms` and `calls` each say where the terms are: give one of "
+            "them, found `under` and `calls`.",
+        ),
+    ],
+)
+def test_places_that_are_none(options: Any, error: Any, message: str) -> None:
+    pattern = re.escape(message).replace("…", ".*")
+    with pytest.raises(error, match=f"^{pattern}$"):
+        RewardDecomposition(Calling(), {"near": 0}, **options)

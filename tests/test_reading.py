@@ -97,7 +97,8 @@ def test_matching_specs() -> None:
         assert match_specs(saved, RewardSpec(("b", "a"), (2, 0))) == RewardSpec(("a", "b"), (0, 2))
     message = (
         "The env's reward components must be those of the model: the model has ['a', 'b'], found "
-        "['a', 'c'] in the env."
+        "['a', 'c'] in the env. `GCRPPO.warm_start(path, env)` begins a new model with what a "
+        "saved one has learned of other components."
     )
     with pytest.raises(ValueError, match=exactly(message)):
         match_specs(saved, RewardSpec(("a", "c"), (0, 1)))

@@ -121,13 +121,23 @@ class TermSource:
             found: Any = self.terms(self.env, info)
             where = "terms(env, info)"
         elif self.under is not None:
-            found = (look_up(info, self.under) or [None])[0]
+            found = self._under(info)
             where = f'info["{self.under}"]'
         else:
             return info, "info"
         if not isinstance(found, Mapping):
             raise ValueError(f"`{where}` must be a dictionary of terms by name, found {found!r}.")
         return found, where
+
+    def _under(self, info: dict[str, Any]) -> Any:
+        assert self.under is not None
+        found = look_up(info, self.under)
+        if not found:
+            raise ValueError(
+                "Parameter `under` must be a key of `info` with a dictionary of terms, found no "
+                f'"{self.under}" among {sorted(map(str, info))}.'
+            )
+        return found[0]
 
 
 class _Recorded:

@@ -57,6 +57,19 @@ def find_fault(
     return None
 
 
+def all_add_up(
+    components: NDArray[Any], rewards: NDArray[Any], tolerance: float = SUM_TOLERANCE
+) -> bool:
+    """Whether components sum to the reward in each step.
+
+    :param components: shape (n, K)
+    :param rewards: shape (n,)
+    :param tolerance: as for :func:`find_fault`
+    """
+    miss = np.abs(components.sum(1) - rewards)
+    return bool((miss <= _allowed(components, rewards, tolerance)).all())
+
+
 def adds_up(row: NDArray[Any], reward: float, tolerance: float = SUM_TOLERANCE) -> bool:
     """Whether components sum to a reward.
 
@@ -64,8 +77,7 @@ def adds_up(row: NDArray[Any], reward: float, tolerance: float = SUM_TOLERANCE) 
     :param reward: their sum, perhaps
     :param tolerance: as for :func:`find_fault`
     """
-    miss = abs(float(row.sum()) - reward)
-    return bool(miss <= _allowed(row[None], np.array([reward]), tolerance)[0])
+    return all_add_up(row[None], np.array([reward]), tolerance)
 
 
 def sum_sentence(row: NDArray[Any], reward: float, spec: RewardSpec, cause: str) -> str:

@@ -24,6 +24,7 @@ import numpy as np
 
 from sb3_gcr import GCRPPO, envs
 from sb3_gcr.simulators.envpool_gym import pool_of
+from sb3_gcr.zoo.components import show_components
 
 if TYPE_CHECKING:
     import optuna
@@ -49,7 +50,7 @@ ENTROPY_GRID: dict[str, Sequence[Any]] = {
 _PROGRAM = "sb3-gcr-zoo"
 _DESCRIPTION = (
     "Train, tune, play and record with rl-zoo3. The commands are rl-zoo3's, with all their "
-    "options, but for tune_entropy."
+    "options, but for tune_entropy and components."
 )
 _EPILOG = (
     f"`{_PROGRAM} COMMAND --help` lists the options of a command. `--vec-env batch`, for all but "
@@ -195,15 +196,18 @@ def _entropy_table(study: optuna.Study) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run a command of rl-zoo3, or ``tune_entropy``.
+    """Run a command of rl-zoo3, ``tune_entropy`` or ``components``.
 
     :param argv: the command and its options; None takes those of the command line
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(_PROGRAM, description=_DESCRIPTION, epilog=_EPILOG)
-    parser.add_argument("command", choices=[*COMMANDS, "tune_entropy"])
+    parser.add_argument("command", choices=[*COMMANDS, "tune_entropy", "components"])
     command = parser.parse_args(arguments[:1]).command
     options = arguments[1:]
+    if command == "components":  # needs no rl-zoo3
+        show_components(f"{_PROGRAM} components", options)
+        return
     try:
         register()
     except ImportError as error:
