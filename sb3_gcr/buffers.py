@@ -119,7 +119,7 @@ class VectorRolloutBuffer(RolloutBuffer):
             }
         for name, tensor in self._tensors.items():
             _each(tensor, partial(_gather, indices), self._shuffled[name])
-        batch_size = batch_size or n_samples
+        batch_size = int(batch_size or n_samples)  # PyTorch takes no integers of NumPy
         parts = {
             name: _each(tensor, partial(th.split, split_size_or_sections=batch_size))
             for name, tensor in self._shuffled.items()

@@ -187,7 +187,7 @@ class GCRPPO(Saving, MultiHeadPPO):
 
         :param seed: None leaves them as they are
         """
-        super().set_random_seed(seed)
+        super().set_random_seed(None if seed is None else int(seed))  # NumPy's integers, too
         if seed is not None:
             self._resolver_rng = np.random.default_rng(seed)
 

@@ -93,13 +93,24 @@ def refuse_infinite_rollout(buffer: RolloutBuffer, timestep: int) -> None:
 
     :param buffer: a rollout
     :param timestep: for the message
-    :raises ValueError: names what is not finite
+    :raises ValueError: names what is not finite, and in which env
     """
+    observations = buffer.observations
+    if isinstance(observations, dict):
+        parts = {f"observations[{key!r}]": part for key, part in observations.items()}
+    else:
+        parts = {"observations": observations}
     for name in ("log_probs", "values", "advantages"):
-        bad = np.argwhere(~np.isfinite(getattr(buffer, name)))
-        if len(bad):
-            raise ValueError(
-                f"The rollout's `{name}` must be finite, found NaN or infinity for env index "
-                f"{bad[-1][1]} before the update at timestep {timestep}. The policy is as it was; "
-                "check rewards and observations, e.g. with VecCheckNan."
-            )
+        parts[name] = getattr(buffer, name)
+    for name, part in parts.items():
+        if np.isfinite(part).all():
+            continue
+        env_index = np.argwhere(~np.isfinite(part))[-1][1]  # of (T, N, …); the last is the cause
+        suspects = (
+            "observations and `log_std`" if name == "log_probs" else "rewards and observations"
+        )
+        raise ValueError(
+            f"The rollout's `{name}` must be finite, found NaN or infinity for env index "
+            f"{env_index} before the update at timestep {timestep}. The policy is as it was; "
+            f"check {suspects}, e.g. with VecCheckNan."
+        )

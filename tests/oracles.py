@@ -1,50 +1,83 @@
 """Independent oracles: naive loops in gradient space, written from the paper's words, with
-gradients instead of Gramians.
+gradients instead of Gramians. What the library draws, they enumerate.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from itertools import permutations, product
 from typing import Any
 
 import numpy as np
 
-from sb3_gcr.angles import visiting_order
+Steps = set[tuple[float, ...]]
 
 
-def pcgrad_with_levels(jacobian: Any, levels: Any, rng: np.random.Generator) -> Any:
-    """Each gradient, projected off every conflicting original gradient of its own or a higher
-    level, in the given order.
+def pcgrad_with_levels(jacobian: Any, levels: Sequence[int]) -> Steps:
+    """All steps that the paper's rule may take.
+
+    Each gradient meets the others of its own level, in any order, and then those of the higher
+    levels from the lowest up, inside a level again in any order; from each original gradient that
+    it conflicts with it is projected off.
     """
-    order = visiting_order(np.asarray(levels), rng)
-    total = np.zeros(jacobian.shape[1])
-    for i, mine in enumerate(jacobian):
-        mine = mine.copy()
-        for j in order[i]:
-            if j == i or levels[j] > levels[i] or not jacobian[j].any():
-                continue
-            dot = mine @ jacobian[j]
-            if dot < 0:
-                mine -= dot / (jacobian[j] @ jacobian[j]) * jacobian[j]
-        total += mine
-    return total
+    outcomes = []
+    for i in range(len(jacobian)):
+        others = [j for j in range(len(jacobian)) if j != i and levels[j] <= levels[i]]
+        found = [_meet(jacobian[i], jacobian[list(order)]) for order in orders(others, levels)]
+        outcomes.append({_rounded(one) for one in found})
+    return {_rounded(sum(map(np.array, one))) for one in product(*outcomes)}
 
 
-def authors_in_place(jacobian: Any, levels: Any, rng: np.random.Generator) -> Any:
-    """One pass over all gradients, each projected off the tasks as the pass has left them so
-    far.
+def orders(met: Sequence[int], levels: Sequence[int]) -> Iterable[tuple[int, ...]]:
+    """All orders from the lowest priority up, free inside a level."""
+    ranks = sorted({levels[j] for j in met}, reverse=True)
+    groups = [permutations([j for j in met if levels[j] == rank]) for rank in ranks]
+    return (sum(parts, ()) for parts in product(*groups))
+
+
+def authors_in_place(jacobian: Any, levels: Sequence[int]) -> Steps:
+    """All steps that the authors' released rule may take: one pass over all gradients in any order,
+    each projected off the tasks, in any order, as the pass has left them so far.
     """
-    gradients = jacobian.copy()
-    n = len(gradients)
-    for i in rng.permutation(n):
-        for j in rng.permutation(n):
-            both_regularisers = levels[i] > 0 and levels[j] > 0
-            task_meets_regulariser = levels[i] == 0 and levels[j] > 0
-            if i == j or both_regularisers or task_meets_regulariser or not gradients[j].any():
-                continue
-            dot = gradients[i] @ gradients[j]
-            if dot < 0:
-                gradients[i] = gradients[i] - dot / (gradients[j] @ gradients[j]) * gradients[j]
-    return gradients.sum(0)
+    n = len(jacobian)
+    steps: Steps = set()
+    for outer in permutations(range(n)):
+        states = [np.array(jacobian, dtype=float)]
+        for i in outer:
+            tasks = [j for j in range(n) if j != i and levels[j] == 0]
+            following = []
+            for state in states:
+                for inner in permutations(tasks):
+                    moved = state.copy()
+                    moved[i] = _meet(state[i], state[list(inner)])
+                    following.append(moved)
+            states = list({_rounded(state.ravel()): state for state in following}.values())
+        steps |= {_rounded(state.sum(0)) for state in states}
+    return steps
+
+
+def unmatched(some: Any, others: Any) -> int:
+    """How many vectors have none that is the same to rounding among others.
+
+    :param some: shape (n, D)
+    :param others: shape (m, D)
+    """
+    some, others = np.array(sorted(some)), np.array(sorted(others))
+    distances = np.abs(some[:, None] - others).max(2).min(1)
+    return int((distances > 1e-6 * (1 + np.abs(some).max(1))).sum())
+
+
+def _meet(mine: Any, others: Any) -> Any:
+    """Take from a gradient what opposes others, one after the other."""
+    for other in others:
+        dot = mine @ other
+        if dot < 0:
+            mine = mine - dot / (other @ other) * other
+    return mine
+
+
+def _rounded(vector: Any) -> tuple[float, ...]:
+    return tuple((np.round(vector, 9) + 0.0).tolist())
 
 
 def random_jacobian(rng: np.random.Generator, n: int, size: int, spread: float = 1.0) -> Any:
