@@ -8,6 +8,7 @@ a thread pool that steps hundreds of them.
 
 import sb3_gcr.envs as envs
 from sb3_gcr.buffers import VectorRolloutBuffer
+from sb3_gcr.conflicts.measuring import measure_conflicts
 from sb3_gcr.evaluation import evaluate_components
 from sb3_gcr.gcrppo import GCRPPO
 from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
@@ -32,4 +33,5 @@ __all__ = [
     "evaluate_components",
     "find_components",
     "latest_checkpoint",
+    "measure_conflicts",
 ]

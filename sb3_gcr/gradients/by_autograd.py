@@ -18,17 +18,17 @@ from sb3_gcr.gradients.hooks import BackwardHooks
 from sb3_gcr.gradients.memory import Weights
 
 
-def gramian_by_passes(
+def jacobian_by_passes(
     log_prob: th.Tensor, cotangents: th.Tensor, parameters: Sequence[th.nn.Parameter]
 ) -> th.Tensor:
-    """G = J Jᵀ with the rows g^(k) = Σ_b c_b^(k) ∇_θ log π_b, by K backward passes.
+    """J with the rows g^(k) = Σ_b c_b^(k) ∇_θ log π_b, by K backward passes.
 
     Only parameters that log π depends on contribute. The graph is kept.
 
     :param log_prob: with its graph, shape (B,)
     :param cotangents: c, shape (B, K)
     :param parameters: θ and others; log π need not depend on all of them
-    :return: G, shape (K, K)
+    :return: J, shape (K, D)
     """
     if not log_prob.requires_grad:  # a frozen actor
         parameters = []
@@ -42,7 +42,14 @@ def gramian_by_passes(
             )
         parts = [gradient.flatten() for gradient in gradients if gradient is not None]
         rows.append(th.cat([no_gradient, *parts]))
-    jacobian = th.stack(rows)
+    return th.stack(rows)
+
+
+def gramian_by_passes(
+    log_prob: th.Tensor, cotangents: th.Tensor, parameters: Sequence[th.nn.Parameter]
+) -> th.Tensor:
+    """G = J Jᵀ of :func:`jacobian_by_passes`, shape (K, K)."""
+    jacobian = jacobian_by_passes(log_prob, cotangents, parameters)
     return jacobian @ jacobian.T
 
 
@@ -92,6 +99,14 @@ class ByAutograd:
             cotangents[n_samples:] = 0
         with self._hooks.silent():
             return gramian_by_passes(self._log_prob, cotangents, self._parameters)
+
+    def jacobian(self, cotangents: th.Tensor) -> th.Tensor:
+        """The component gradients of the minibatch as rows J, shape (K, D).
+
+        :param cotangents: c, shape (B, K)
+        """
+        with self._hooks.silent():
+            return jacobian_by_passes(self._log_prob, cotangents, self._parameters)
 
     def backward(
         self,

@@ -155,10 +155,10 @@ def log_cosines(
 
 
 def cosine_figure(spec: RewardSpec, matrices: Mapping[str, NDArray[np.float64]]) -> Figure:
-    """Cosine matrices side by side; red pairs fight, blue pairs agree.
+    """Cosine matrices side by side; red pairs fight, blue pairs agree, grey ones have no signal.
 
     :param spec: names the components
-    :param matrices: matrices of shape (K, K) by title
+    :param matrices: matrices of shape (K, K) by title, NaN where there is no signal
     :raises ImportError: if matplotlib is missing
     """
     try:
@@ -170,6 +170,7 @@ def cosine_figure(spec: RewardSpec, matrices: Mapping[str, NDArray[np.float64]])
     figure = Figure(figsize=(side * len(matrices) + 0.8, side), layout="constrained")
     axes = figure.subplots(1, len(matrices), squeeze=False)[0]
     for axis, (title, matrix) in zip(axes, matrices.items(), strict=True):
+        axis.set_facecolor("#e6e6e6")  # where there is no signal
         image = axis.imshow(matrix, cmap="RdBu", vmin=-1, vmax=1)
         axis.set_title(title)
         axis.set_xticks(range(n), spec.names, rotation=45, ha="right")
@@ -177,8 +178,7 @@ def cosine_figure(spec: RewardSpec, matrices: Mapping[str, NDArray[np.float64]])
         for i in range(n):
             for j in range(n):
                 colour = "white" if abs(matrix[i, j]) > 0.6 else "black"
-                axis.text(
-                    j, i, f"{matrix[i, j]:.2f}", ha="center", va="center", color=colour, fontsize=8
-                )
+                label = "–" if np.isnan(matrix[i, j]) else f"{matrix[i, j]:.2f}"
+                axis.text(j, i, label, ha="center", va="center", color=colour, fontsize=8)
     figure.colorbar(image, ax=list(axes), label="cosine between gradients", shrink=0.8)
     return figure

@@ -19,8 +19,11 @@ def _of_observations(vec_normalize: VecNormalize) -> dict[str, RunningMeanStd]:
     return found if isinstance(found, dict) else {"": found}
 
 
-def _count_seen(vec_normalize: VecNormalize) -> float:
-    """How many observations or returns VecNormalize has seen."""
+def count_seen(vec_normalize: VecNormalize) -> float:
+    """How many observations or returns VecNormalize has seen.
+
+    :param vec_normalize: the wrapper of an env
+    """
     moments = (*_of_observations(vec_normalize).values(), vec_normalize.ret_rms)
     return max(float(one.count) for one in moments)
 
@@ -94,7 +97,7 @@ def restore_statistics(
         return "VecNormalize: no statistics in the file"
     if vec_normalize is None:
         return "VecNormalize: none, though the file has statistics"
-    if _count_seen(vec_normalize) >= ONE_OBSERVATION:
+    if count_seen(vec_normalize) >= ONE_OBSERVATION:
         return "VecNormalize keeps its own statistics"
     observations = _of_observations(vec_normalize)
     if observations and saved["observations"] and set(observations) != set(saved["observations"]):
