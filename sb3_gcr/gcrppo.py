@@ -22,7 +22,7 @@ from sb3_gcr.checks import check_choice
 from sb3_gcr.gradients import METHODS, ActorCritic, choose
 from sb3_gcr.gradients.by_hand import ByHand
 from sb3_gcr.gradients.memory import Array, Weights
-from sb3_gcr.logs.figures import Record, Samples, by_key, join, mean_cosines, of_rollout
+from sb3_gcr.logs.figures import Record, Samples, by_key, join, mean_cosines, of_rollout, unbiased
 from sb3_gcr.logs.shown import CosineTable, log_cosines
 from sb3_gcr.losses import CLIPPINGS, Clip, kl_estimates, surrogate_cotangents, value_cotangents
 from sb3_gcr.minibatches import (
@@ -231,6 +231,7 @@ class GCRPPO(Saving, MultiHeadPPO):
         normalisation = Normalisation(self._scope, self.kappa_max).of_rollout(self.rollout_buffer)
         with actor_critic.session():
             for _ in range(self.n_epochs):
+                actor_critic.begin_epoch()
                 goes_on = self._train_epoch(update, normalisation)
                 update.record.end_epoch()
                 if not goes_on:
@@ -277,12 +278,15 @@ class GCRPPO(Saving, MultiHeadPPO):
             actor_critic.gramian(cotangents, self.gramian_samples), log_prob, batch.old_log_prob
         )
         weights = self._weigh(gramian, self._resolver_rng)  # w (K,)
+        # Later epochs have the same samples, and so nothing new to say.
+        unbiased_gramian = None if record.epochs else actor_critic.unbiased_gramian()
         record.add(
             _samples(batch, values, log_prob),
             actor_critic.entropy_loss(),
             batch.kappa,
             gramian,
             weights,
+            unbiased_gramian,
         )
         if self._leaves_target(kl):
             return False
@@ -397,8 +401,14 @@ class GCRPPO(Saving, MultiHeadPPO):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if self.n_components > 1:
             as_picture = self._n_rollouts_learned % FIGURE_INTERVAL == 1
-            matrix = mean_cosines(update.record)
-            log_cosines(self.logger, self.reward_spec, self.num_timesteps, matrix, as_picture)
+            log_cosines(
+                self.logger,
+                self.reward_spec,
+                self.num_timesteps,
+                mean_cosines(update.record),
+                unbiased(update.record),
+                as_picture,
+            )
 
     def learn(
         self: SelfGCRPPO,

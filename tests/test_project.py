@@ -114,9 +114,15 @@ ARROWS = {
         "saving.statistics",
     },
     "logs.__init__": set(),
-    "logs.figures": {"angles", "gradients.memory", "losses", "rewards.spec"},
-    "logs.shown": {"rewards.spec"},
-    "logs.report": {"logs.shown", "rewards.spec"},
+    "logs.figures": {
+        "angles",
+        "conflicts.estimators",
+        "gradients.memory",
+        "losses",
+        "rewards.spec",
+    },
+    "logs.shown": {"conflicts.estimators", "rewards.spec"},
+    "logs.report": {"conflicts.estimators", "logs.shown", "rewards.spec"},
     "multi_head_ppo": {
         "advantages",
         "buffers",

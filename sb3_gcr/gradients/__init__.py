@@ -53,6 +53,14 @@ class ActorCritic(Protocol):
         :param n_samples: take the first n rows instead of all; they are in random order already
         """
 
+    def begin_epoch(self) -> None:
+        """The samples of the minibatches to come have been seen before."""
+
+    def unbiased_gramian(self) -> Array | None:
+        """Ĝ of the last :meth:`gramian`, without the noise that its gradients share, shape (K, K):
+        from products of different samples alone. None where there are none.
+        """
+
     def backward(
         self, cotangents: Array, weights: Weights, value_gradients: Array, ent_coef: float
     ) -> None:

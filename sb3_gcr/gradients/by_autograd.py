@@ -67,6 +67,8 @@ class ByAutograd:
         self.policy = policy
         self._parameters = [p for p in policy.parameters() if p.requires_grad]
         self._hooks = BackwardHooks(policy)
+        self._jacobian: th.Tensor | None = None  # J of this minibatch, and of the one before
+        self._before: th.Tensor | None = None
 
     def session(self) -> AbstractContextManager[object]:
         """Threads are PyTorch's own business here."""
@@ -97,8 +99,21 @@ class ByAutograd:
         if n_samples is not None:
             cotangents = cotangents.clone()
             cotangents[n_samples:] = 0
-        with self._hooks.silent():
-            return gramian_by_passes(self._log_prob, cotangents, self._parameters)
+        self._before, self._jacobian = self._jacobian, self.jacobian(cotangents)
+        return self._jacobian @ self._jacobian.T
+
+    def begin_epoch(self) -> None:
+        """Forget the minibatch before: it has samples in common with the next."""
+        self._jacobian = None
+
+    def unbiased_gramian(self) -> th.Tensor | None:
+        """Ĝ from products with the minibatch before, one optimiser step ago, shape (K, K); None
+        for the first of an epoch.
+        """
+        if self._before is None or self._jacobian is None:
+            return None
+        product = self._jacobian @ self._before.T
+        return (product + product.T) / 2
 
     def jacobian(self, cotangents: th.Tensor) -> th.Tensor:
         """The component gradients of the minibatch as rows J, shape (K, D).

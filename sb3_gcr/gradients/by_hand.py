@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_gcr.gradients.fitting import actor_modules, critic_modules
-from sb3_gcr.gradients.gramian import Layer, component_gramian
+from sb3_gcr.gradients.gramian import Layer, component_gramian, own_products, without_own
 from sb3_gcr.gradients.heads import head_of
 from sb3_gcr.gradients.layers import Mlp
 from sb3_gcr.gradients.memory import Array, Memory, Weights, is_small
@@ -88,7 +88,19 @@ class ByHand:
             Layer(delta[rows], features[rows])
             for delta, features in zip(signals, self.actor.inputs, strict=True)
         ]
-        return component_gramian(layers, self._scores[rows], cotangents[rows])
+        self._factors = (layers, self._scores[rows], cotangents[rows])
+        self._gramian = component_gramian(*self._factors)
+        return self._gramian
+
+    def begin_epoch(self) -> None:
+        """Nothing is kept from one minibatch to the next."""
+
+    def unbiased_gramian(self) -> Array | None:
+        """Ĝ over pairs of different samples, shape (K, K); None for a single sample."""
+        n_samples = len(self._factors[-1])
+        if n_samples < 2:
+            return None
+        return without_own(self._gramian, own_products(*self._factors), n_samples)
 
     def backward(
         self, cotangents: Array, weights: Weights, value_gradients: Array, ent_coef: float

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch as th
 
 from sb3_gcr.gradients.memory import Array
@@ -66,6 +67,43 @@ def component_gramian(layers: list[Layer], scores: Array, cotangents: Array) -> 
     if by_samples:
         gramian += gramian_by_samples(by_samples, cotangents)
     return gramian
+
+
+def own_products(layers: list[Layer], scores: Array, cotangents: Array) -> Array:
+    r"""Cᵀ diag(M) C: the part of G in which a sample meets itself, and with it the noise that the K
+    gradients share.
+
+    .. math:: M_{bb} = \sum_{layers} |δ_b|^2 |h_b|^2 + |s_b|^2
+
+    :param layers: Δ and H of each layer
+    :param scores: S, shape (B, n)
+    :param cotangents: C, shape (B, K)
+    :return: shape (K, K)
+    """
+    squares = _squared_rows(scores)
+    for signals, inputs in layers:
+        squares = squares + _squared_rows(signals) * _squared_rows(inputs)
+    return (cotangents.T * squares) @ cotangents
+
+
+def _squared_rows(rows: Array) -> Array:
+    """|row|², shape (B,)."""
+    if isinstance(rows, th.Tensor):
+        return rows.square().sum(1)
+    return np.einsum("bi,bi->b", rows, rows)
+
+
+def without_own(gramian: Array, own: Array, n_samples: int) -> Array:
+    r"""An unbiased Gramian: the mean over pairs of different samples alone.
+
+    .. math:: Ĝ = \frac{B}{B-1} (C^T M C - C^T \mathrm{diag}(M) C)
+
+    :param gramian: G of the means over B samples, shape (K, K)
+    :param own: of :func:`own_products`, shape (K, K)
+    :param n_samples: B ≥ 2
+    :return: Ĝ, shape (K, K)
+    """
+    return n_samples / (n_samples - 1) * (gramian - own)
 
 
 def _prefers_samples(layer: Layer, cotangents: Array) -> bool:

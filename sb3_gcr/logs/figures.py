@@ -17,6 +17,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.utils import explained_variance
 
 from sb3_gcr.angles import conflicts, cosines
+from sb3_gcr.conflicts.estimators import Estimate, signal_shares
 from sb3_gcr.gradients.memory import Array, Weights
 from sb3_gcr.losses import Clip, brakes, kl_estimates, leaves_range, surrogate_losses, value_errors
 from sb3_gcr.rewards.spec import RewardSpec
@@ -61,6 +62,7 @@ class Figures(NamedTuple):
     brakes: Numbers  # (M,)
     clip_fractions: Numbers  # (M,)
     kl: Numbers  # (M,)
+    unbiased: Numbers  # Ĝ, (M, K, K), NaN where a minibatch has none
 
 
 #: Figures of an update by logger key, one number each.
@@ -80,6 +82,7 @@ COMPONENT_FIGURES: dict[str, Callable[[Figures], Numbers]] = {
     "gcr/grad_norm": lambda f: np.sqrt(f.gramians.diagonal(0, 1, 2)).mean(0),
     "gcr/in_conflict": lambda f: conflicts(f.gramians).any(2).mean(0),
     "gcr/value_loss": lambda f: f.value_losses.mean(0),
+    "gcr/signal": lambda f: signals(f),
 }
 
 
@@ -101,6 +104,7 @@ class Record:
         self._kappas: list[float] = []
         self._gramians: list[Numbers] = []
         self._weights: list[Weights] = []
+        self._unbiased: list[Array | None] = []
 
     def __len__(self) -> int:
         """Number of minibatches so far."""
@@ -113,6 +117,7 @@ class Record:
         kappa: float,
         gramian: Numbers,
         weights: Weights,
+        unbiased_gramian: Array | None = None,
     ) -> None:
         """Take down a minibatch.
 
@@ -121,7 +126,9 @@ class Record:
         :param kappa: κ, a number or an array of one
         :param gramian: G, shape (K, K)
         :param weights: w, shape (K,)
+        :param unbiased_gramian: Ĝ, shape (K, K), where there is one
         """
+        self._unbiased.append(unbiased_gramian)
         self._samples.append(samples)
         self._entropy_losses.append(entropy_loss)
         self._kappas.append(kappa)
@@ -152,6 +159,7 @@ class Record:
                 brakes=by_name["brakes"][:, 0],
                 clip_fractions=by_name["clip_fractions"][:, 0],
                 kl=by_name["kl"][:, 0],
+                unbiased=_on_host(self._unbiased, np.shape(self._gramians[0])),
             )
         )
         self._forget()
@@ -183,6 +191,7 @@ def by_key(record: Record, spec: RewardSpec) -> tuple[dict[str, float], dict[str
         f"{key}/{name}": float(number)
         for key, figure in COMPONENT_FIGURES.items()
         for name, number in zip(spec.names, figure(figures), strict=True)
+        if not np.isnan(number)  # no minibatch has an unbiased Gramian
     }
     return scalars, components
 
@@ -212,6 +221,37 @@ def mean_cosines(record: Record) -> Numbers:
     return np.asarray(cosines(record.update().gramians).mean(0))
 
 
+def unbiased(record: Record) -> Estimate:
+    """Ĝ, mean over the minibatches of the first epoch, and its standard errors from their scatter;
+    NaN where there are none, and an error that is not known.
+    """
+    known = _with_unbiased(record.update())
+    gramians = known.unbiased
+    if len(gramians) == 0:
+        none = np.full(gramians.shape[1:], np.nan)
+        return Estimate(none, none, none.diagonal())
+    errors = np.full(gramians.shape[1:], np.nan)
+    if len(gramians) > 1:
+        errors = gramians.std(0, ddof=1) / np.sqrt(len(gramians))
+    return Estimate(gramians.mean(0), errors, known.gramians.mean(0).diagonal())
+
+
+def signals(figures: Figures) -> Numbers:
+    """Share of each component's squared gradient norm in a minibatch that is signal, shape (K,);
+    NaN where no minibatch has an unbiased Gramian.
+    """
+    known = _with_unbiased(figures)
+    if len(known.unbiased) == 0:
+        return np.full(figures.gramians.shape[-1], np.nan)
+    return signal_shares(known.unbiased.mean(0), known.gramians.mean(0).diagonal())
+
+
+def _with_unbiased(figures: Figures) -> Figures:
+    """Those of minibatches that have an unbiased Gramian."""
+    known = ~np.isnan(figures.unbiased[:, 0, 0])
+    return Figures(*(column[known] for column in figures))
+
+
 def n_conflicts(gramians: Numbers) -> Numbers:
     """Number of conflicting pairs of each minibatch, shape (M,).
 
@@ -234,6 +274,16 @@ def join(arrays: Sequence[Array]) -> th.Tensor:
     if isinstance(arrays[0], th.Tensor):
         return th.cat(list(arrays))
     return th.from_numpy(np.concatenate(arrays))
+
+
+def _on_host(gramians: Sequence[Array | None], shape: tuple[int, ...]) -> Numbers:
+    """Ĝ of each minibatch, NaN where there is none, with one transfer; shape (M, K, K)."""
+    host = np.full((len(gramians), *shape), np.nan)
+    known = [index for index, gramian in enumerate(gramians) if gramian is not None]
+    if known:
+        joined = join([gramians[index][None] for index in known])
+        host[known] = joined.cpu().numpy()
+    return host
 
 
 def _as_vector(numbers: Sequence[Array]) -> th.Tensor:

@@ -8,8 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sb3_gcr.logs.shown import COSINES_FILE, cosine_figure, format_table
+from sb3_gcr.conflicts.estimators import Estimate
+from sb3_gcr.logs.shown import (
+    COSINES_FILE,
+    UNBIASED_FILE,
+    cosine_figure,
+    format_table,
+    product_names,
+)
 from sb3_gcr.rewards.spec import RewardSpec, level_label
 
 if TYPE_CHECKING:
@@ -17,6 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STEPS = "time/total_timesteps"
+#: Updates that an average of unbiased products takes at least, for its error.
+FEWEST_UPDATES = 3
 
 
 class Report(NamedTuple):
@@ -30,14 +40,18 @@ def write_report(folder: str | Path, spec: RewardSpec) -> Report:
     """Write ``returns.png``, ``cosines.png`` and ``conflicts.png`` beside the log of a run, and
     make its table.
 
+    The cosines are those without the noise that gradients of the same samples share, where the log
+    has them for at least three updates; the picture says which they are.
+
     :param folder: where the logger wrote ``progress.csv`` (``configure(folder, ["csv", ...])``) and
-        GCRPPO ``cosines.csv``
+        GCRPPO ``cosines.csv`` and ``cosines_unbiased.csv``
     :param spec: ``model.reward_spec``, at least two components
     :raises FileNotFoundError: if the folder has no such files
     :raises ValueError: if the log ends before the first update, or is that of other components
     :raises ImportError: if pandas or matplotlib is missing
     """
-    progress, cosines = _read(folder, "progress.csv"), _read(folder, COSINES_FILE)
+    progress = _read(folder, "progress.csv")
+    _read(folder, COSINES_FILE)
     missing = [key for name in spec.names if (key := f"gcr/weight/{name}") not in progress]
     if missing:
         raise ValueError(
@@ -47,7 +61,7 @@ def write_report(folder: str | Path, spec: RewardSpec) -> Report:
         )
     figures = {
         "returns.png": _returns_figure(progress, spec),
-        "cosines.png": _cosines_figure(cosines, spec),
+        "cosines.png": _cosines_figure(folder, spec),
         "conflicts.png": _conflicts_figure(progress, spec),
     }
     for name, figure in figures.items():
@@ -133,17 +147,65 @@ def _conflicts_figure(progress: pd.DataFrame, spec: RewardSpec) -> Figure:
     return figure
 
 
-def _cosines_figure(cosines: pd.DataFrame, spec: RewardSpec) -> Figure:
-    """Mean cosines over the first and the last tenth of the updates."""
-    tenth = max(1, len(cosines) // 10)
-    matrices = {}
-    for when, rows in (("start", cosines.iloc[:tenth]), ("end", cosines.iloc[-tenth:])):
-        matrix = np.eye(len(spec))
-        matrix[np.triu_indices(len(spec), 1)] = rows.drop(columns=STEPS).mean().to_numpy()
-        steps = (
-            f"up to {rows[STEPS].iloc[-1]:,}"
-            if when == "start"
-            else f"from {rows[STEPS].iloc[0]:,}"
+def _cosines_figure(folder: str | Path, spec: RewardSpec) -> Figure:
+    """Cosines over the first and the last tenth of the updates: from products without shared noise
+    where the log has enough of them, else within minibatches.
+    """
+    within = _read(folder, COSINES_FILE)
+    unbiased = _read_unbiased(folder)
+    if unbiased is None:
+        return cosine_figure(
+            spec,
+            {
+                f"{when}\nwithin minibatches": _mean_matrix(rows, spec)
+                for when, rows in _tenths(within, 1)
+            },
         )
-        matrices[f"{when} of training\n{steps} steps"] = np.triu(matrix) + np.triu(matrix, 1).T
-    return cosine_figure(spec, matrices)
+    return cosine_figure(
+        spec,
+        {
+            f"{when}\nwithout shared noise": _estimate(rows, spec).cosines
+            for when, rows in _tenths(unbiased, FEWEST_UPDATES)
+        },
+    )
+
+
+def _read_unbiased(folder: str | Path) -> pd.DataFrame | None:
+    """The log of unbiased products; None where it does not have enough updates with some."""
+    if not (Path(folder) / UNBIASED_FILE).exists():
+        return None
+    rows = _read(folder, UNBIASED_FILE)
+    rows = rows[rows.iloc[:, -1].notna()]
+    return rows if len(rows) >= FEWEST_UPDATES else None
+
+
+def _tenths(rows: pd.DataFrame, fewest: int) -> list[tuple[str, pd.DataFrame]]:
+    """The first and the last tenth of the updates with what to call them."""
+    tenth = max(fewest, len(rows) // 10)
+    first, last = rows.iloc[:tenth], rows.iloc[-tenth:]
+    return [
+        (f"start of training\nup to {first[STEPS].iloc[-1]:,} steps", first),
+        (f"end of training\nfrom {last[STEPS].iloc[0]:,} steps", last),
+    ]
+
+
+def _mean_matrix(rows: pd.DataFrame, spec: RewardSpec) -> NDArray[np.float64]:
+    """Means of the columns of pairs as a matrix with ones on its diagonal."""
+    matrix = np.eye(len(spec))
+    matrix[np.triu_indices(len(spec), 1)] = rows.drop(columns=STEPS).mean().to_numpy()
+    return np.triu(matrix) + np.triu(matrix, 1).T
+
+
+def _estimate(rows: pd.DataFrame, spec: RewardSpec) -> Estimate:
+    """Mean unbiased products over updates, and their errors from their scatter: each update has a
+    rollout of its own.
+    """
+    n_components = len(spec)
+    upper = np.triu_indices(n_components)
+    products = rows[product_names(spec)].to_numpy()
+    gramian, errors = np.zeros((2, n_components, n_components))
+    gramian[upper] = products.mean(0)
+    errors[upper] = products.std(0, ddof=1) / np.sqrt(len(products))
+    gramian = np.triu(gramian) + np.triu(gramian, 1).T
+    errors = np.triu(errors) + np.triu(errors, 1).T
+    return Estimate(gramian, errors, gramian.diagonal())

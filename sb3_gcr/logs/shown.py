@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 from stable_baselines3.common.logger import Figure as Picture
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
+from sb3_gcr.conflicts.estimators import Estimate
 from sb3_gcr.rewards.spec import RewardSpec, level_label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: File in the logger's folder with one row of cosines per update.
+#: File in the logger's folder with one row of cosines per update, within its minibatches.
 COSINES_FILE = "cosines.csv"
+#: The same without the noise that gradients of the same samples share, and the products behind it.
+UNBIASED_FILE = "cosines_unbiased.csv"
 
 
 def component_table(spec: RewardSpec, values: Mapping[str, Any]) -> str:
@@ -65,9 +68,10 @@ def format_table(rows: Sequence[Sequence[str]]) -> str:
 
 
 class CosineTable(KVWriter):
-    """The file ``cosines.csv`` beside the other files of a logger: one row of cosines per update.
+    """The files ``cosines.csv`` and ``cosines_unbiased.csv`` beside the other files of a logger:
+    one row of cosines per update.
 
-    It begins anew with its logger, as ``progress.csv`` does.
+    They begin anew with their logger, as ``progress.csv`` does.
 
     :param folder: of the logger
     :param spec: names the components
@@ -80,7 +84,11 @@ class CosineTable(KVWriter):
         names = [f"{spec.names[i]} | {spec.names[j]}" for i, j in zip(*self._pairs, strict=True)]
         self._path = Path(folder) / COSINES_FILE
         self._path.unlink(missing_ok=True)
-        self._add(["time/total_timesteps", *names])
+        self._add(self._path, ["time/total_timesteps", *names])
+        self._unbiased_path = Path(folder) / UNBIASED_FILE
+        self._unbiased_path.unlink(missing_ok=True)
+        products = product_names(spec)
+        self._add(self._unbiased_path, ["time/total_timesteps", *names, *products])
 
     @classmethod
     def of(cls, logger: Logger, spec: RewardSpec) -> CosineTable | None:
@@ -105,16 +113,24 @@ class CosineTable(KVWriter):
             )
         return found[0]
 
-    def append(self, timestep: int, matrix: NDArray[np.float64]) -> None:
-        """Add one row, the cosines of all pairs.
+    def append(
+        self, timestep: int, matrix: NDArray[np.float64], unbiased: Estimate | None = None
+    ) -> None:
+        """Add one row to each file, the cosines of all pairs.
 
         :param timestep: first column
-        :param matrix: shape (K, K)
+        :param matrix: shape (K, K), within minibatches
+        :param unbiased: without shared noise; a pair without a signal stays blank
         """
-        self._add([timestep, *(f"{cosine:.6g}" for cosine in matrix[self._pairs])])
+        self._add(self._path, [timestep, *_cells(matrix[self._pairs])])
+        if unbiased is None:
+            return
+        products = unbiased.gramian[np.triu_indices(len(self.spec))]
+        row = [*_cells(unbiased.cosines[self._pairs]), *_cells(products)]
+        self._add(self._unbiased_path, [timestep, *row])
 
-    def _add(self, row: Sequence[object]) -> None:
-        with self._path.open("a", newline="") as file:
+    def _add(self, path: Path, row: Sequence[object]) -> None:
+        with path.open("a", newline="") as file:
             csv.writer(file).writerow(row)
 
     def write(
@@ -129,28 +145,45 @@ class CosineTable(KVWriter):
         """Nothing is open between two rows."""
 
 
+def product_names(spec: RewardSpec) -> list[str]:
+    """Columns of the products Ĝ_ij, i ≤ j."""
+    first, second = np.triu_indices(len(spec))
+    return [f"{spec.names[i]} * {spec.names[j]}" for i, j in zip(first, second, strict=True)]
+
+
+def _cells(numbers: NDArray[np.float64]) -> list[str]:
+    """Numbers of a row; NaN is blank."""
+    return ["" if np.isnan(number) else f"{number:.6g}" for number in numbers]
+
+
 def log_cosines(
     logger: Logger,
     spec: RewardSpec,
     timestep: int,
     matrix: NDArray[np.float64],
+    unbiased: Estimate,
     as_picture: bool,
 ) -> None:
-    """Write a cosine matrix to its file, and to TensorBoard as a picture.
+    """Write cosine matrices to their files, and to TensorBoard as a picture.
 
     :param logger: SB3's
     :param spec: names the components
     :param timestep: of the update
-    :param matrix: shape (K, K)
-    :param as_picture: whether to draw it
+    :param matrix: shape (K, K), within minibatches
+    :param unbiased: without shared noise
+    :param as_picture: whether to draw them
     """
     table = CosineTable.of(logger, spec)
     if table is None:
         return
-    table.append(timestep, matrix)
+    table.append(timestep, matrix, unbiased)
     formats = logger.output_formats
     if as_picture and any(isinstance(f, TensorBoardOutputFormat) for f in formats):
-        figure = Picture(cosine_figure(spec, {f"{timestep} steps": matrix}), close=False)
+        matrices = {
+            f"{timestep} steps\nwithout shared noise": unbiased.cosines,
+            f"{timestep} steps\nwithin minibatches": matrix,
+        }
+        figure = Picture(cosine_figure(spec, matrices), close=False)
         logger.record("gcr/cosines", figure, exclude=("stdout", "log", "json", "csv"))
 
 
