@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,26 +14,31 @@ from stable_baselines3.common.policies import (
     ActorCriticPolicy,
     MultiInputActorCriticPolicy,
 )
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_gcr.optimisers import FusedAdam
 
 
-def check_value_heads(policy: ActorCriticPolicy, n_components: int) -> None:
+def check_value_heads(
+    policy: ActorCriticPolicy,
+    n_components: int,
+    value_of: Callable[[PyTorchObs], th.Tensor],
+) -> None:
     """Refuse a critic that does not give one value per reward component.
 
     A single one would be taken for the value of every component without a word.
 
     :param policy: its training mode and all generators stay as they are
     :param n_components: number K of reward components
+    :param value_of: the critic: V of observations
     :raises ValueError: names the shape that was found
     """
     observations: Any = create_empty_array(policy.observation_space, 2, np.zeros)
     was_training = policy.training
     policy.set_training_mode(False)
     with th.random.fork_rng(devices=[]), th.no_grad():
-        values = policy.predict_values(policy.obs_to_tensor(observations)[0])
+        values = value_of(policy.obs_to_tensor(observations)[0])
     policy.set_training_mode(was_training)
     if values.shape == (2, n_components):
         return

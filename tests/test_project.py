@@ -117,9 +117,8 @@ ARROWS = {
     "logs.figures": {"angles", "gradients.memory", "losses", "rewards.spec"},
     "logs.shown": {"rewards.spec"},
     "logs.report": {"logs.shown", "rewards.spec"},
-    "multi_head_ppo": {
+    "multi_head": {
         "advantages",
-        "buffers",
         "diagnosis",
         "logs.shown",
         "policies",
@@ -128,7 +127,8 @@ ARROWS = {
         "rewards.returns",
         "rewards.spec",
     },
-    "gcrppo": {
+    "multi_head_ppo": {"buffers", "multi_head", "policies"},
+    "update": {
         "arguments",
         "checks",
         "gradients.__init__",
@@ -138,11 +138,18 @@ ARROWS = {
         "logs.shown",
         "losses",
         "minibatches",
-        "multi_head_ppo",
+        "multi_head",
         "resolvers",
         "rewards.decomposition",
-        "saving.model",
         "schedules",
+    },
+    "gcrppo": {
+        "arguments",
+        "gradients.__init__",
+        "multi_head_ppo",
+        "resolvers",
+        "saving.model",
+        "update",
     },
     "saving.__init__": set(),
     "saving.checkpoints": set(),
