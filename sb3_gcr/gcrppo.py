@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 
 from sb3_gcr.arguments import check_arguments
 from sb3_gcr.gradients import ActorCritic, choose
@@ -124,7 +124,7 @@ class GCRPPO(Saving, ConflictResolution, MultiHeadPPO):
             surrogate_clipping=surrogate_clipping,
         )
 
-    def _choose_actor_critic(self) -> ActorCritic:
+    def _choose_actor_critic(self) -> ActorCritic[PyTorchObs]:
         return choose(self.policy, self.gramian_method, self.batch_size)
 
     def learn(

@@ -80,11 +80,15 @@ class MultiHeadActorCriticPolicy(ActorCriticPolicy):
         self.value_net = nn.Linear(self.mlp_extractor.latent_dim_vf, self.n_components)
         if self.ortho_init:
             self.value_net.apply(partial(self.init_weights, gain=1))
-        # The fused Adam takes the same steps up to rounding; only where the user chose no optimiser
-        # of their own.
+        self._make_optimizer(lr_schedule(1))
+
+    def _make_optimizer(self, learning_rate: float) -> None:
+        """Anew, for the K heads; the fused Adam takes the same steps up to rounding, and is taken
+        only where the user chose no optimiser of their own.
+        """
         optimizer_class: Any = FusedAdam if self._fuse_optimizer else self.optimizer_class
         self.optimizer = optimizer_class(
-            self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs
+            self.parameters(), lr=learning_rate, **self.optimizer_kwargs
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

@@ -43,7 +43,7 @@ FIGURE_INTERVAL = 10
 class Update(NamedTuple):
     """What the minibatches of one update share; it ends with the update."""
 
-    actor_critic: ActorCritic
+    actor_critic: ActorCritic[Any]
     clip: Clip
     record: Record
 
@@ -183,7 +183,7 @@ class ConflictResolution(MultiHead):
         self._n_rollouts_learned += 1
         self._log_update(update)
 
-    def _choose_actor_critic(self) -> ActorCritic:
+    def _choose_actor_critic(self) -> ActorCritic[Any]:
         """How the policy, as it is now, is evaluated and differentiated."""
         raise NotImplementedError
 
