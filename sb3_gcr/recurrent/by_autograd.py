@@ -66,20 +66,33 @@ class RecurrentByAutograd(ByAutograd):
         """G = J Jᵀ of the component gradients, shape (K, K).
 
         :param cotangents: c, shape (B, K)
-        :param n_samples: take whole sequences in random order until they have n valid steps,
-            instead of all
+        :param n_samples: take whole sequences in random order until they have n valid steps, where
+            that costs less than all of them
         """
         self._jacobian: Jacobian | None = None
         lengths = self._sequences.lengths
-        if n_samples is not None:
-            drawn = draw_sequences(lengths, n_samples, self._rng)
-            if len(drawn) < len(lengths):
-                is_drawn = th.zeros_like(lengths, dtype=th.bool)
-                is_drawn[drawn] = True
-                rows = cotangents[is_drawn.repeat_interleave(lengths)]
-                return gramian_by_passes(self._log_prob_of(drawn), rows, self._parameters)
+        drawn = self._draw(n_samples, cotangents)
+        if drawn is not None:
+            is_drawn = th.zeros_like(lengths, dtype=th.bool)
+            is_drawn[drawn] = True
+            rows = cotangents[is_drawn.repeat_interleave(lengths)]
+            return gramian_by_passes(self._log_prob_of(drawn), rows, self._parameters)
         self._jacobian = jacobian_by_passes(self._log_prob, cotangents, self._parameters)
         return self._jacobian.gramian()
+
+    def _draw(self, n_samples: int | None, cotangents: th.Tensor) -> th.Tensor | None:
+        """Numbers of some sequences, or None for all.
+
+        In units of a forward pass of the actor, a backward pass costs 2: all sequences cost K of
+        those; a share f of them costs f of K + 1/2, and the step one more, which J saves otherwise.
+        """
+        if n_samples is None:
+            return None
+        n_valid, n_components = cotangents.shape
+        lengths = self._sequences.lengths
+        drawn = draw_sequences(lengths, n_samples, self._rng)
+        share = int(lengths[drawn].sum()) / n_valid
+        return drawn if 2 + share * (2 * n_components + 1) < 2 * n_components else None
 
     def _log_prob_of(self, drawn: th.Tensor) -> th.Tensor:
         """Log π of the valid steps of some sequences, from a forward of the actor for them alone.
