@@ -18,16 +18,14 @@ from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, Roll
 from sb3_gcr.advantages import component_gae
 
 
-class VectorRolloutBuffer(RolloutBuffer):
-    """Rollout buffer whose ``rewards``, ``values``, ``advantages`` and ``returns`` have shape (T,
-    N, K).
+class ComponentBuffer(RolloutBuffer):
+    """A base before a rollout buffer, whose ``rewards``, ``values``, ``advantages`` and ``returns``
+    then have shape (T, N, K).
 
-    :param args: the arguments of SB3's ``RolloutBuffer``
+    :param args: the arguments of that buffer
     :param n_components: number K of reward components
-    :param kwargs: the keyword arguments of SB3's ``RolloutBuffer``
+    :param kwargs: the keyword arguments of that buffer
     """
-
-    _samples_class: type[Any] = RolloutBufferSamples
 
     def __init__(self, *args: Any, n_components: int = 1, **kwargs: Any):
         self.n_components = n_components
@@ -36,8 +34,6 @@ class VectorRolloutBuffer(RolloutBuffer):
     def reset(self) -> None:
         """Empty the buffer."""
         super().reset()
-        self._tensors: dict[str, Any] = {}
-        self._shuffled: dict[str, Any] = {}
         for name in ("rewards", "values", "advantages", "returns"):
             setattr(
                 self,
@@ -53,6 +49,7 @@ class VectorRolloutBuffer(RolloutBuffer):
         episode_start: NDArray[Any],
         value: th.Tensor,
         log_prob: th.Tensor,
+        **kwargs: Any,
     ) -> None:
         """Add one step of all envs.
 
@@ -62,6 +59,7 @@ class VectorRolloutBuffer(RolloutBuffer):
         :param episode_start: shape (N,)
         :param value: V(s_t), shape (N, K)
         :param log_prob: log π(a_t|s_t), shape (N,)
+        :param kwargs: what the buffer keeps beside, such as the states of an LSTM
         :raises ValueError: for values of another shape, which would be repeated for all components
         """
         if value.shape[1:] != (self.n_components,):
@@ -71,7 +69,7 @@ class VectorRolloutBuffer(RolloutBuffer):
             )
         # SB3 flattens values, and a single number broadcasts; the values themselves are stored
         # below.
-        super().add(obs, action, reward, episode_start, value[:1, :1], log_prob)
+        super().add(obs, action, reward, episode_start, value[:1, :1], log_prob, **kwargs)
         self.values[self.pos - 1] = value.cpu().numpy()
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: NDArray[Any]) -> None:
@@ -91,6 +89,24 @@ class VectorRolloutBuffer(RolloutBuffer):
             self.gae_lambda,
         )
         self.returns = self.advantages + self.values
+
+
+class VectorRolloutBuffer(ComponentBuffer):
+    """Rollout buffer whose ``rewards``, ``values``, ``advantages`` and ``returns`` have shape (T,
+    N, K).
+
+    :param args: the arguments of SB3's ``RolloutBuffer``
+    :param n_components: number K of reward components
+    :param kwargs: the keyword arguments of SB3's ``RolloutBuffer``
+    """
+
+    _samples_class: type[Any] = RolloutBufferSamples
+
+    def reset(self) -> None:
+        """Empty the buffer."""
+        super().reset()
+        self._tensors: dict[str, Any] = {}
+        self._shuffled: dict[str, Any] = {}
 
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
         """Yield the rollout in random minibatches; ``old_values``, ``advantages`` and ``returns``

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gcr.advantages import normalize_jointly
 from sb3_gcr.gradients import ActorCritic
@@ -21,8 +20,8 @@ SCOPES = ("rollout", "minibatch")
 class Minibatch(NamedTuple):
     """B samples of a rollout as the update takes them; K components."""
 
-    observations: PyTorchObs  # (B, …)
-    actions: th.Tensor  # (B, …)
+    observations: Any  # what the actor-critic evaluates: (B, …), or sequences
+    actions: th.Tensor  # (B, …), or those of the sequences
     old_log_prob: Array  # log π_old(a|s), (B,)
     old_values: Array  # (B, K)
     returns: Array  # Ĝ, (B, K)
@@ -64,7 +63,7 @@ def minibatches(
     buffer: RolloutBuffer,
     batch_size: int,
     normalisation: Normalisation,
-    actor_critic: ActorCritic,
+    actor_critic: ActorCritic[Any],
     discrete: bool,
 ) -> Iterator[Minibatch]:
     """One pass over a rollout in random order.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,26 +14,31 @@ from stable_baselines3.common.policies import (
     ActorCriticPolicy,
     MultiInputActorCriticPolicy,
 )
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_gcr.optimisers import FusedAdam
 
 
-def check_value_heads(policy: ActorCriticPolicy, n_components: int) -> None:
+def check_value_heads(
+    policy: ActorCriticPolicy,
+    n_components: int,
+    value_of: Callable[[PyTorchObs], th.Tensor],
+) -> None:
     """Refuse a critic that does not give one value per reward component.
 
     A single one would be taken for the value of every component without a word.
 
     :param policy: its training mode and all generators stay as they are
     :param n_components: number K of reward components
+    :param value_of: the critic: V of observations
     :raises ValueError: names the shape that was found
     """
     observations: Any = create_empty_array(policy.observation_space, 2, np.zeros)
     was_training = policy.training
     policy.set_training_mode(False)
     with th.random.fork_rng(devices=[]), th.no_grad():
-        values = policy.predict_values(policy.obs_to_tensor(observations)[0])
+        values = value_of(policy.obs_to_tensor(observations)[0])
     policy.set_training_mode(was_training)
     if values.shape == (2, n_components):
         return
@@ -74,11 +80,15 @@ class MultiHeadActorCriticPolicy(ActorCriticPolicy):
         self.value_net = nn.Linear(self.mlp_extractor.latent_dim_vf, self.n_components)
         if self.ortho_init:
             self.value_net.apply(partial(self.init_weights, gain=1))
-        # The fused Adam takes the same steps up to rounding; only where the user chose no optimiser
-        # of their own.
+        self._make_optimizer(lr_schedule(1))
+
+    def _make_optimizer(self, learning_rate: float) -> None:
+        """Anew, for the K heads; the fused Adam takes the same steps up to rounding, and is taken
+        only where the user chose no optimiser of their own.
+        """
         optimizer_class: Any = FusedAdam if self._fuse_optimizer else self.optimizer_class
         self.optimizer = optimizer_class(
-            self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs
+            self.parameters(), lr=learning_rate, **self.optimizer_kwargs
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

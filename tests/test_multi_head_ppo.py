@@ -252,10 +252,10 @@ def test_a_frozen_actor_lets_the_critic_warm_up(action: str) -> None:
 def test_wrong_policy_classes() -> None:
     choices = (
         "Parameter `policy` must be one of ['CnnPolicy', 'MlpPolicy', 'MultiInputPolicy'] or a "
-        "subclass of "
-        "MultiHeadActorCriticPolicy, found {}. Recurrent and maskable policies are not supported."
+        "subclass of MultiHeadActorCriticPolicy, found {}."
     )
-    with pytest.raises(ValueError, match=exactly(choices.format("'MlpLstmPolicy'"))):
+    with_lstm = " A policy with an LSTM needs `sb3_gcr.recurrent.RecurrentGCRPPO`."
+    with pytest.raises(ValueError, match=exactly(choices.format("'MlpLstmPolicy'") + with_lstm)):
         GCRPPO("MlpLstmPolicy", make_vec_env(Env, 1))
     with pytest.raises(ValueError, match=exactly(choices.format("'ActorCriticPolicy'"))):
         GCRPPO(ActorCriticPolicy, make_vec_env(Env, 1))
@@ -264,7 +264,9 @@ def test_wrong_policy_classes() -> None:
         (ActorCriticPolicy,),
         {"__module__": "sb3_contrib.common.recurrent.policies"},
     )
-    with pytest.raises(ValueError, match=exactly(choices.format("'RecurrentActorCriticPolicy'"))):
+    with pytest.raises(
+        ValueError, match=exactly(choices.format("'RecurrentActorCriticPolicy'") + with_lstm)
+    ):
         GCRPPO(recurrent, make_vec_env(lambda: Env(None), 1))
     learned(GCRPPO(ActorCriticPolicy, make_vec_env(lambda: Env(None), 1), **SMALL))
 

@@ -123,9 +123,8 @@ ARROWS = {
     },
     "logs.shown": {"conflicts.estimators", "rewards.spec"},
     "logs.report": {"conflicts.estimators", "logs.shown", "rewards.spec"},
-    "multi_head_ppo": {
+    "multi_head": {
         "advantages",
-        "buffers",
         "diagnosis",
         "logs.shown",
         "policies",
@@ -134,7 +133,8 @@ ARROWS = {
         "rewards.returns",
         "rewards.spec",
     },
-    "gcrppo": {
+    "multi_head_ppo": {"buffers", "multi_head", "policies"},
+    "update": {
         "arguments",
         "checks",
         "gradients.__init__",
@@ -144,11 +144,18 @@ ARROWS = {
         "logs.shown",
         "losses",
         "minibatches",
-        "multi_head_ppo",
+        "multi_head",
         "resolvers",
         "rewards.decomposition",
-        "saving.model",
         "schedules",
+    },
+    "gcrppo": {
+        "arguments",
+        "gradients.__init__",
+        "multi_head_ppo",
+        "resolvers",
+        "saving.model",
+        "update",
     },
     "saving.__init__": set(),
     "saving.checkpoints": set(),

@@ -381,24 +381,20 @@ def test_files_without_plain_settings_are_refused(path: Path) -> None:
         ),
         (
             {"counters": {"policy": 3}},
-            "The counters in a file must be numbers named ['_has_paid', 'num_timesteps', "
-            "'_n_updates', "
-            "'_n_rollouts_learned', "
-            "'_adaptive_learning_rate'], found policy=3.",
+            "The counters in a file must be numbers named ['_has_paid', '_n_rollouts_learned', "
+            "'_adaptive_learning_rate', 'num_timesteps', '_n_updates'], found policy=3.",
         ),
         (
             {"counters": {"num_timesteps": "many"}},
-            "The counters in a file must be numbers named ['_has_paid', 'num_timesteps', "
-            "'_n_updates', "
-            "'_n_rollouts_learned', "
-            "'_adaptive_learning_rate'], found num_timesteps='many'.",
+            "The counters in a file must be numbers named ['_has_paid', '_n_rollouts_learned', "
+            "'_adaptive_learning_rate', 'num_timesteps', '_n_updates'], "
+            "found num_timesteps='many'.",
         ),
         (
             {"policy": None},
             "Parameter `policy` must be one of ['CnnPolicy', 'MlpPolicy', 'MultiInputPolicy'] or a "
             "subclass of "
-            "MultiHeadActorCriticPolicy, found 'None'. Recurrent and maskable policies are not "
-            "supported.",
+            "MultiHeadActorCriticPolicy, found 'None'.",
         ),
         (
             {

@@ -9,7 +9,7 @@ linear layers, on the ``layers`` and ``heads`` that it needs. ``fitting`` says w
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -20,11 +20,14 @@ from sb3_gcr.gradients.by_hand import ByHand
 from sb3_gcr.gradients.fitting import fits
 from sb3_gcr.gradients.memory import Array, Weights
 
+#: What a policy sees of a minibatch: its observations, or sequences of them.
+Observed = TypeVar("Observed", contravariant=True)
+
 #: Values of GCRPPO's parameter ``gramian_method``.
 METHODS = ("auto", "one_backward", "passes")
 
 
-class ActorCritic(Protocol):
+class ActorCritic(Protocol[Observed]):
     """A policy as the update sees it, minibatch by minibatch, under ``torch.no_grad``.
 
     The order of calls is :meth:`evaluate`, :meth:`gramian`, :meth:`backward`,
@@ -40,7 +43,7 @@ class ActorCritic(Protocol):
     def array(self, tensor: th.Tensor) -> Array:
         """A tensor of the rollout in the form that the other methods take and return."""
 
-    def evaluate(self, observations: PyTorchObs, actions: th.Tensor) -> tuple[Array, Array]:
+    def evaluate(self, observations: Observed, actions: th.Tensor) -> tuple[Array, Array]:
         """Values V, shape (B, K), and log π(a|s), shape (B,)."""
 
     def entropy_loss(self) -> Array:
@@ -76,7 +79,7 @@ class ActorCritic(Protocol):
         """Scale all gradients to a joint norm of at most ``max_norm``; return the norm before."""
 
 
-def choose(policy: ActorCriticPolicy, method: str, batch_size: int) -> ActorCritic:
+def choose(policy: ActorCriticPolicy, method: str, batch_size: int) -> ActorCritic[PyTorchObs]:
     """The cheapest way through a policy that gives the exact Gramian.
 
     :param policy: the policy as it is now: layers may be frozen, replaced or hooked at any time
