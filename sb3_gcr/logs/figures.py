@@ -279,10 +279,10 @@ def join(arrays: Sequence[Array]) -> th.Tensor:
 def _on_host(gramians: Sequence[Array | None], shape: tuple[int, ...]) -> Numbers:
     """Ĝ of each minibatch, NaN where there is none, with one transfer; shape (M, K, K)."""
     host = np.full((len(gramians), *shape), np.nan)
-    known = [index for index, gramian in enumerate(gramians) if gramian is not None]
+    known = {index: gramian for index, gramian in enumerate(gramians) if gramian is not None}
     if known:
-        joined = join([gramians[index][None] for index in known])
-        host[known] = joined.cpu().numpy()
+        joined = join([gramian[None] for gramian in known.values()])
+        host[list(known)] = joined.cpu().numpy()
     return host
 
 
