@@ -221,6 +221,23 @@ def test_runs_that_nobody_can_repeat_and_runs_without_a_return_are_warnings(tmp_
     ) in text
 
 
+def test_a_baseline_that_learns_nothing_is_a_warning(tmp_path: Path) -> None:
+    cells = all_cells()
+    for one in cells:
+        one["scalars"]["random_return"] = 500.0
+    lines = report.answer(write_study(tmp_path, cells, seeds=2)).splitlines()
+    # t = 4.3027 times the root of 2
+    assert lines[1] == (
+        "GCRPPO learns faster than PPO here: return over training +12 (95 % interval 5.92 to 18.1, "
+        "Welch), better in 4 of 4 pairs of runs."
+    )
+    assert lines[-1] == (
+        "Warning: On MyEnv-v0 the return of PPO over training is not shown to be above that of "
+        "random actions: differences are in the return's own unit, without a margin. Give it more "
+        "steps."
+    )
+
+
 def test_one_method_is_no_comparison(tmp_path: Path) -> None:
     cells = [one for one in all_cells() if one["cell"]["method"] == "gcr"]
     folder = write_study(tmp_path, cells, methods=["gcr"], seeds=2)

@@ -293,6 +293,19 @@ def hypothesis(one: Judged) -> str:
     return f"{lead} {numbers}{look}{wins}{evidence}."
 
 
+def no_share(baseline: str, configuration: str) -> str:
+    """The warning that differences are not in per cent.
+
+    :param baseline: of the headline
+    :param configuration: where it is so
+    """
+    return (
+        f"On {configuration} the return of {called(baseline)} over training is not shown to be "
+        "above that of random actions: differences are in the return's own unit, without a margin. "
+        "Give it more steps."
+    )
+
+
 def mixed_digests(method: str, baseline: str, configuration: str, counts: dict[str, int]) -> str:
     """The warning that a contrast has cells of several versions of the code."""
     versions = ", ".join(f"{str(digest)[:12]}: {n}" for digest, n in counts.items())

@@ -229,8 +229,10 @@ def general_warnings(study: Collected, cells: pd.DataFrame) -> list[str]:
 
 
 def contrast_warnings(configuration: str, cells: pd.DataFrame, found: Answer) -> list[str]:
-    """Contrasts of mixed versions, and seeds that change nothing."""
+    """Contrasts without a share or of mixed versions, and seeds that change nothing."""
     warnings = []
+    if found.headline is not None and not found.headline.relative:
+        warnings.append(answers.no_share(found.headline.baseline, configuration))
     for one in found.contrasts[:1] + [c for c in (found.surgery, found.heads) if c is not None]:
         own = cells[cells["method"].isin([one.baseline, one.method])]
         counts = own["digest"].fillna("unknown").value_counts().to_dict()
