@@ -95,7 +95,7 @@ class TermSource:
         if self.cumulative:
             self._before = raw
             weighted = weighted - before
-        return weighted * self.current_weights(), raw
+        return weighted if self.weights is None else weighted * self.current_weights(), raw
 
     def current_weights(self) -> NDArray[np.float64]:
         """The weight of each component in this step, shape (K,)."""

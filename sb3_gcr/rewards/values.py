@@ -103,6 +103,9 @@ def collect(
         found = look_up(source, key)
         if not found:
             raise ValueError(_missing(key, source, where))
+        if isinstance(found[0], float | np.floating) and not isinstance(level, Mapping):
+            values.append(float(found[0]))  # nearly always
+            continue
         place = f'`{where}["{key}"]`'
         if not isinstance(level, Mapping):
             values.extend(as_vector(found[0], place, 1))
