@@ -153,6 +153,7 @@ def test_logged_keys(tmp_path: Path) -> None:
             "gcr/weight",
             "gcr/grad_norm",
             "gcr/in_conflict",
+            "gcr/signal",
             "rollout/ep_rew",
             "gcr/value_loss",
             "gcr/explained_variance",

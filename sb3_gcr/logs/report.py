@@ -172,9 +172,7 @@ def _cosines_figure(folder: str | Path, spec: RewardSpec) -> Figure:
     )
 
 
-def _check_cosines(
-    rows: pd.DataFrame, name: str, expected: list[str], folder: str | Path
-) -> None:
+def _check_cosines(rows: pd.DataFrame, name: str, expected: list[str], folder: str | Path) -> None:
     """Refuse the file of other components, or of no update."""
     found = list(rows.columns.drop(STEPS, errors="ignore"))
     if found != expected or not len(rows):
