@@ -8,12 +8,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 
 from sb3_gcr import GCRPPO, RewardDecomposition, evaluate_components
 from tests.envs import SPEC, BatchedEnv, Env
 from tests.test_returns import Counting, Lives
+from tests.training import SMALL, exactly
 
 
 @pytest.fixture(scope="module")
@@ -126,3 +128,30 @@ def test_an_env_without_components(model: GCRPPO) -> None:
     )
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         evaluate_components(model, DummyVecEnv([lambda: Env(None)]), 1)
+
+
+class BatchedEnvWithInfos(BatchedEnv):
+    def __init__(self) -> None:
+        super().__init__()
+        self.infos = [{} for _ in range(4)]
+
+
+def test_means_and_episodes_of_a_vec_env() -> None:
+    model = GCRPPO("MlpPolicy", make_vec_env(Env, 1), **SMALL)
+    env = make_vec_env(Env, 3, seed=1)
+    result = evaluate_components(model, env, 7)
+    assert list(result.component_means) == list(SPEC.names)
+    assert sum(result.component_means.values()) == pytest.approx(result.mean_reward, rel=1e-5)
+    rewards, lengths, components = evaluate_components(model, env, 7, return_episode_rewards=True)
+    np.testing.assert_allclose(
+        np.sum(list(components.values()), axis=0), rewards, rtol=1e-4, atol=1e-4
+    )
+    assert len(lengths) == 7
+    batched = evaluate_components(model, BatchedEnvWithInfos(), 3, warn=False)
+    assert np.isfinite(list(batched.component_means.values())).all()
+    message = (
+        "Parameter `env` must report reward components, found none. Wrap it with "
+        "`RewardDecomposition`."
+    )
+    with pytest.raises(ValueError, match=exactly(message)):
+        evaluate_components(model, make_vec_env(lambda: Env(None), 1), 1)

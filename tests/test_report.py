@@ -10,7 +10,7 @@ import pytest
 
 from sb3_gcr import RewardSpec
 from sb3_gcr.logs.report import write_report
-from sb3_gcr.logs.shown import CosineTable, component_table
+from sb3_gcr.logs.shown import CosineTable
 
 SPEC = RewardSpec(("run", "save"), (0, 1))
 
@@ -64,29 +64,6 @@ def test_a_folder_without_a_log(tmp_path: Path) -> None:
     )
     with pytest.raises(FileNotFoundError, match=f"^{re.escape(message)}$"):
         write_report(tmp_path, SPEC)
-
-
-def test_component_table_leaves_missing_figures_blank() -> None:
-    table = component_table(SPEC, {"rollout/ep_rew/run": 12.345, "gcr/weight/save": 1.0})
-    run, save = (line for line in table.splitlines() if line.startswith(("| run", "| save")))
-    assert [cell.strip() for cell in run.strip("|").split("|")] == [
-        "run",
-        "task",
-        "12.3",
-        "",
-        "",
-        "",
-        "",
-    ]
-    assert [cell.strip() for cell in save.strip("|").split("|")] == [
-        "save",
-        "regulariser",
-        "",
-        "1",
-        "",
-        "",
-        "",
-    ]
 
 
 def test_a_log_that_ends_before_the_first_update(tmp_path: Path) -> None:

@@ -118,6 +118,8 @@ class ByAutograd:
         """
         if self._before is None or self._jacobian is None:
             return None
+        if self._before.shape != self._jacobian.shape:  # not all layers take part at any time
+            return None
         product = self._jacobian @ self._before.T
         return (product + product.T) / 2
 

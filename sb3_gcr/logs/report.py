@@ -16,6 +16,7 @@ from sb3_gcr.logs.shown import (
     UNBIASED_FILE,
     cosine_figure,
     format_table,
+    pair_names,
     product_names,
 )
 from sb3_gcr.rewards.spec import RewardSpec, level_label
@@ -51,7 +52,7 @@ def write_report(folder: str | Path, spec: RewardSpec) -> Report:
     :raises ImportError: if pandas or matplotlib is missing
     """
     progress = _read(folder, "progress.csv")
-    _read(folder, COSINES_FILE)
+    _read(folder, COSINES_FILE)  # named before anything else that may be wrong
     missing = [key for name in spec.names if (key := f"gcr/weight/{name}") not in progress]
     if missing:
         raise ValueError(
@@ -152,7 +153,8 @@ def _cosines_figure(folder: str | Path, spec: RewardSpec) -> Figure:
     where the log has enough of them, else within minibatches.
     """
     within = _read(folder, COSINES_FILE)
-    unbiased = _read_unbiased(folder)
+    _check_cosines(within, COSINES_FILE, pair_names(spec), folder)
+    unbiased = _read_unbiased(folder, spec)
     if unbiased is None:
         return cosine_figure(
             spec,
@@ -170,11 +172,23 @@ def _cosines_figure(folder: str | Path, spec: RewardSpec) -> Figure:
     )
 
 
-def _read_unbiased(folder: str | Path) -> pd.DataFrame | None:
+def _check_cosines(rows: pd.DataFrame, name: str, expected: list[str], folder: str | Path) -> None:
+    """Refuse the file of other components, or of no update."""
+    found = list(rows.columns.drop(STEPS, errors="ignore"))
+    if found != expected or not len(rows):
+        raise ValueError(
+            f"Parameter `folder` must contain a '{name}' with the columns {expected} and at least "
+            f"one update, found {found} and {len(rows)} updates in '{folder}'."
+        )
+
+
+def _read_unbiased(folder: str | Path, spec: RewardSpec) -> pd.DataFrame | None:
     """The log of unbiased products; None where it does not have enough updates with some."""
     if not (Path(folder) / UNBIASED_FILE).exists():
         return None
     rows = _read(folder, UNBIASED_FILE)
+    if len(rows):
+        _check_cosines(rows, UNBIASED_FILE, pair_names(spec) + product_names(spec), folder)
     rows = rows[rows.iloc[:, -1].notna()]
     return rows if len(rows) >= FEWEST_UPDATES else None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,9 +80,8 @@ class CosineTable(KVWriter):
 
     def __init__(self, folder: str, spec: RewardSpec):
         self.spec = spec
-        n_components = len(spec)
-        self._pairs = np.triu_indices(n_components, 1)
-        names = [f"{spec.names[i]} | {spec.names[j]}" for i, j in zip(*self._pairs, strict=True)]
+        self._pairs = np.triu_indices(len(spec), 1)
+        names = pair_names(spec)
         self._path = Path(folder) / COSINES_FILE
         self._path.unlink(missing_ok=True)
         self._add(self._path, ["time/total_timesteps", *names])
@@ -143,6 +143,11 @@ class CosineTable(KVWriter):
 
     def close(self) -> None:
         """Nothing is open between two rows."""
+
+
+def pair_names(spec: RewardSpec) -> list[str]:
+    """Columns of the cosines of all pairs i < j."""
+    return [f"{first} | {second}" for first, second in combinations(spec.names, 2)]
 
 
 def product_names(spec: RewardSpec) -> list[str]:
