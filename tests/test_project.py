@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[1]
 ARROWS = {
     "advantages": set(),
     "angles": set(),
+    "averaging": set(),
     "arguments": {"checks"},
     "checks": set(),
     "diagnosis": set(),
@@ -136,6 +137,7 @@ ARROWS = {
     "multi_head_ppo": {"buffers", "multi_head", "policies"},
     "update": {
         "arguments",
+        "averaging",
         "checks",
         "gradients.__init__",
         "gradients.by_hand",
@@ -417,6 +419,7 @@ ARROWS = {
 #: Packages that the pure modules do without.
 FORBIDDEN = {
     "advantages": {"torch", "stable_baselines3"},
+    "averaging": {"torch", "stable_baselines3"},
     "conflicts.estimators": {"torch", "stable_baselines3"},
     "conflicts.blocks": {"torch", "stable_baselines3"},
     "resolvers": {"stable_baselines3"},
