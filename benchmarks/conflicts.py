@@ -1,7 +1,7 @@
 """Conflicts of HumanoidRun: between rollouts, and inside minibatches of several sizes.
 
-``python -m benchmarks.conflicts train`` trains the agent, ``python -m benchmarks.conflicts measure``
-writes docs/data/conflicts.json, from which ``python docs/pictures.py cosines`` draws.
+``python -m benchmarks.conflicts train`` trains the agent; with ``measure`` in place of ``train``
+it writes docs/data/conflicts.json, from which ``python docs/pictures.py noise`` draws.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch import nn
 from sb3_gcr import GCRPPO, envs
 from sb3_gcr.angles import cosines
 from sb3_gcr.conflicts.blocks import Blocks
-from sb3_gcr.conflicts.estimators import estimate
+from sb3_gcr.conflicts.estimators import Estimate, estimate
 from sb3_gcr.conflicts.measuring import rollout_gradients
 from sb3_gcr.conflicts.result import Conflicts
 from sb3_gcr.gradients.by_hand import ByHand
@@ -127,17 +127,20 @@ def measure(arguments: argparse.Namespace) -> None:
 
 def summary(pairs: list[tuple[Numbers, Numbers]]) -> dict[str, Any]:
     """Cosines within minibatches of one size, and from their unbiased products together."""
-    gramians, unbiased = (np.concatenate(arrays) for arrays in zip(*pairs, strict=True))
+    gramians = np.concatenate([gramian for gramian, _ in pairs])
     naive = cosines(gramians)
     low, high = np.quantile(naive, (0.1, 0.9), axis=0)
-    together = unbiased.mean(0)
-    lengths = np.sqrt(np.where(together.diagonal() > 0, together.diagonal(), np.nan))
+    by_rollout = np.array([unbiased.mean(0) for _, unbiased in pairs])
+    together = by_rollout.mean(0)
+    errors = by_rollout.std(0, ddof=1) / np.sqrt(len(by_rollout))
+    squared_norms = gramians.mean(0).diagonal()
+    found = Estimate(together, errors, squared_norms)
     return {
         "naive": naive.mean(0).tolist(),
         "low": low.tolist(),
         "high": high.tolist(),
-        "unbiased": (together / np.outer(lengths, lengths)).tolist(),
-        "signal": (together.diagonal() / gramians.mean(0).diagonal()).tolist(),
+        "unbiased": found.cosines.tolist(),
+        "signal": found.signal.tolist(),
     }
 
 

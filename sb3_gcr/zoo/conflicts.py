@@ -67,7 +67,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
 
 def _measure(options: argparse.Namespace) -> tuple[Path, Conflicts]:
     """The agent's folder, and what is found."""
-    from huggingface_sb3 import EnvironmentName
+    from huggingface_sb3 import EnvironmentName  # type: ignore[import-untyped]
     from rl_zoo3 import ALGOS
     from rl_zoo3.utils import get_model_path
 
