@@ -1,12 +1,15 @@
-"""The pictures of method.md and logs.md: ``python docs/pictures.py`` makes them again in a few
-minutes.
+"""The pictures of method.md, logs.md and conflicts.md: ``python docs/pictures.py`` makes them again
+in a few minutes.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -24,6 +27,12 @@ IMAGES = Path(__file__).parent / "images"
 #: Two tasks that conflict, and a regulariser against both.
 GRADIENTS = np.array([[1.0, 0.0], [-0.6, 0.8], [-3.0, -3.0]])
 LEVELS = np.array([0, 0, 1])
+#: Pairs of HumanoidRun in the picture of noise.
+NOISE_PAIRS = (
+    ("alive", "joint_pos_limits"),
+    ("move_to_target", "energy"),
+    ("progress", "action_l2"),
+)
 BLUE, ORANGE, GREY, RED = "#1f6fb4", "#d9730d", "#8a8a8a", "#b3261e"
 
 
@@ -175,17 +184,54 @@ def conflict(log: EventAccumulator) -> Figure:
     return figure
 
 
+def noise(data: dict[str, Any], pairs: Sequence[tuple[str, str]]) -> Figure:
+    """Cosines within minibatches over their size, against those of independent rollouts.
+
+    :param data: of ``python -m benchmarks.conflicts measure``
+    :param pairs: names of the terms, one panel each
+    """
+    figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    sizes = [int(size) for size in data["minibatches"]]
+    for axis, pair in zip(figure.subplots(1, len(pairs), sharey=True), pairs, strict=True):
+        i, j = (data["names"].index(name) for name in pair)
+        of_size = {
+            key: [numbers[key][i][j] for numbers in data["minibatches"].values()]
+            for key in ("naive", "low", "high", "unbiased")
+        }
+        truth, z = data["cosines"][i][j], data["z"][i][j]
+        axis.fill_between(sizes, of_size["low"], of_size["high"], color=ORANGE, alpha=0.2, lw=0)
+        axis.plot(sizes, of_size["naive"], "o-", color=ORANGE, label="within a minibatch, mean")
+        unbiased = np.array(of_size["unbiased"], dtype=float).clip(-1, 1)
+        axis.plot(sizes, unbiased, "s--", color=BLUE, label="different samples only, all together")
+        axis.axhline(truth, color=RED, lw=2, label="different rollouts")
+        axis.axhline(0, color=GREY, lw=0.8)
+        axis.set_xscale("log", base=2)
+        axis.set_xticks(sizes, [str(size) for size in sizes])
+        axis.set(xlabel="samples in a minibatch", ylim=(-1.05, 1.05))
+        axis.set_title(f"{pair[0]}, {pair[1]}\n{truth:+.2f}, z = {z:+.1f}", fontsize=10)
+        axis.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("cosine between gradients")
+    figure.axes[-1].legend(fontsize=8, loc="upper right")
+    return figure
+
+
 def main() -> None:
     """Make all pictures, or those that are named."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "names", nargs="*", metavar="NAME", help="counterexample, clipping, conflict (default: all)"
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help="counterexample, clipping, conflict, noise (default: all)",
     )
     parser.add_argument(
         "--timesteps", type=int, default=100_000, help="of the training for `conflict`"
     )
     arguments = parser.parse_args()
-    names = arguments.names or ["counterexample", "clipping", "conflict"]
+    names = arguments.names or ["counterexample", "clipping", "conflict", "noise"]
+    if "noise" in names:
+        data = json.loads((IMAGES.parent / "data" / "conflicts.json").read_text())
+        noise(data, NOISE_PAIRS).savefig(IMAGES / "noise.png", dpi=130)
     if "clipping" in names:
         clipping().savefig(IMAGES / "clipping.png", dpi=130)
     if "counterexample" in names:

@@ -27,6 +27,7 @@ NUMBERS: dict[str, dict[str, Any]] = {
     "kappa_max": {"low": 0, "above": True},
     "desired_kl": {"low": 0, "above": True, "optional": True},
     "gramian_samples": {"low": 1, "integer": True, "optional": True},
+    "gramian_average": {"low": 1, "integer": True, "optional": True},
 }
 FLAGS = ("normalize_advantage", "use_sde")
 

@@ -45,6 +45,8 @@ class GCRPPO(Saving, ConflictResolution, MultiHeadPPO):
     :param surrogate_clipping: what decides whether a sample is clipped: "joint", the summed
         advantage as in PPO, or "component", each component's own as in the paper, which holds the
         policy back wherever components disagree
+    :param gramian_average: an experiment: resolvers see unbiased Gramians, averaged over about so
+        many minibatches, in place of the minibatch's own; None is the paper's
     :raises ValueError: for an unknown resolver or scope, a wrong policy class, a spec that does not
         match a loaded model
     """
@@ -85,6 +87,7 @@ class GCRPPO(Saving, ConflictResolution, MultiHeadPPO):
         gramian_method: str = "auto",
         gramian_samples: int | None = None,
         surrogate_clipping: str = "joint",
+        gramian_average: int | None = None,
     ):
         check_arguments(locals())
         super().__init__(
@@ -122,6 +125,7 @@ class GCRPPO(Saving, ConflictResolution, MultiHeadPPO):
             gramian_method=gramian_method,
             gramian_samples=gramian_samples,
             surrogate_clipping=surrogate_clipping,
+            gramian_average=gramian_average,
         )
 
     def _choose_actor_critic(self) -> ActorCritic[PyTorchObs]:

@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_gcr.arguments import check_arguments
+from sb3_gcr.averaging import GramianAverage
 from sb3_gcr.checks import check_choice
 from sb3_gcr.gradients import METHODS, ActorCritic
 from sb3_gcr.gradients.by_hand import ByHand
@@ -65,7 +66,7 @@ class ConflictResolution(MultiHead):
 
     #: Kept in every file, see :class:`~sb3_gcr.saving.model.Saving`.
     saved_numbers: ClassVar[tuple[str, ...]] = ("_n_rollouts_learned", "_adaptive_learning_rate")
-    unsaved: ClassVar[tuple[str, ...]] = ("_resolve",)
+    unsaved: ClassVar[tuple[str, ...]] = ("_resolve", "_average")
     followers: ClassVar[tuple[tuple[str, str], ...]] = (
         ("_adaptive_learning_rate", "learning_rate"),
         ("_resolver_rng", "seed"),
@@ -91,6 +92,7 @@ class ConflictResolution(MultiHead):
         gramian_method: str,
         gramian_samples: int | None,
         surrogate_clipping: str,
+        gramian_average: int | None = None,
         **kwargs: Any,
     ):
         self.resolver = resolver
@@ -101,6 +103,8 @@ class ConflictResolution(MultiHead):
         self.gramian_method = gramian_method
         self.gramian_samples = gramian_samples
         self.surrogate_clipping = surrogate_clipping
+        self.gramian_average = gramian_average
+        self._average: GramianAverage | None = None
         self._resolver_rng: np.random.Generator | None = None
         self._adaptive_learning_rate: float | None = None
         self._n_rollouts_learned = 0
@@ -111,6 +115,8 @@ class ConflictResolution(MultiHead):
     def _setup_model(self) -> None:
         self._check_parameters()
         self._resolve = bind_resolver(self.resolver, self.resolver_kwargs)
+        n_averaged = self.gramian_average
+        self._average = None if n_averaged is None else GramianAverage(n_averaged)
         loaded_rng = self._resolver_rng
         super()._setup_model()
         self._resolver_rng = loaded_rng or self._resolver_rng or np.random.default_rng()
@@ -225,7 +231,7 @@ class ConflictResolution(MultiHead):
         gramian, kl = self._to_host(  # G (K, K)
             actor_critic.gramian(cotangents, self.gramian_samples), log_prob, batch.old_log_prob
         )
-        weights = self._weigh(gramian, self._resolver_rng)  # w (K,)
+        weights = self._weigh(self._seen(gramian, actor_critic), self._resolver_rng)  # w (K,)
         # Later epochs have the same samples, and so nothing new to say.
         unbiased_gramian = None if record.epochs else actor_critic.unbiased_gramian()
         record.add(
@@ -246,6 +252,17 @@ class ConflictResolution(MultiHead):
         self._refuse_infinite(record, actor_critic.clip_gradients(self.max_grad_norm))
         self.policy.optimizer.step()
         return True
+
+    def _seen(
+        self, gramian: NDArray[np.float64], actor_critic: ActorCritic[Any]
+    ) -> NDArray[np.float64]:
+        """What the resolver sees: the minibatch's own G, or an average of unbiased ones."""
+        if self._average is None:
+            return gramian
+        found = actor_critic.unbiased_gramian()
+        host = None if found is None else join([found]).cpu().numpy().astype(float)
+        average = self._average.add(host)
+        return gramian if average is None else average
 
     def _to_host(
         self, gramian: Array, log_prob: Array, old_log_prob: Array

@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[1]
 ARROWS = {
     "advantages": set(),
     "angles": set(),
+    "averaging": set(),
     "arguments": {"checks"},
     "checks": set(),
     "diagnosis": set(),
@@ -136,6 +137,7 @@ ARROWS = {
     "multi_head_ppo": {"buffers", "multi_head", "policies"},
     "update": {
         "arguments",
+        "averaging",
         "checks",
         "gradients.__init__",
         "gradients.by_hand",
@@ -195,8 +197,9 @@ ARROWS = {
     },
     "zoo.__init__": {"zoo.commands"},
     "zoo.__main__": {"zoo.commands"},
-    "zoo.commands": {"simulators.envpool_gym", "zoo.components"},
+    "zoo.commands": {"simulators.envpool_gym", "zoo.components", "zoo.conflicts"},
     "zoo.components": {"rewards.finding"},
+    "zoo.conflicts": {"conflicts.measuring", "conflicts.result", "rewards.gymnasium_envs"},
     "envs.__init__": {"envs.tasks.catalogue", "simulators.envpool_gym"},
     "envs.task": {"rewards.spec"},
     "envs.curriculum": {"rewards.layers"},
@@ -416,6 +419,7 @@ ARROWS = {
 #: Packages that the pure modules do without.
 FORBIDDEN = {
     "advantages": {"torch", "stable_baselines3"},
+    "averaging": {"torch", "stable_baselines3"},
     "conflicts.estimators": {"torch", "stable_baselines3"},
     "conflicts.blocks": {"torch", "stable_baselines3"},
     "resolvers": {"stable_baselines3"},

@@ -56,7 +56,8 @@ def measure_conflicts(
 
     The model, its env, the statistics of every VecNormalize, and Python's, NumPy's and PyTorch's
     generators are afterwards what they were. ``env`` is stepped. It is seen with the statistics of
-    the model's own VecNormalize, where the model has one.
+    the model's own VecNormalize, where the model has one; else its ``norm_reward`` must be that of
+    training, because a critic's values have the units of the rewards.
 
     SB3's ``PPO`` has one value head, so one for each term is fitted first to four more rollouts, on
     the features of its critic.

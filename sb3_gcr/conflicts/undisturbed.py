@@ -14,9 +14,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_gcr.rewards.layers import layers_of
 
 #: What VecNormalize learns from the steps of its env.
-LEARNED = ("training", "obs_rms", "ret_rms", "returns", "old_obs", "old_reward")
-#: And what makes of observations and rewards what a policy has learned from.
-STATISTICS = ("obs_rms", "ret_rms")
+LEARNED = ("training", "obs_rms", "ret_rms", "returns", "old_obs", "old_reward", "norm_reward")
+#: And what makes of observations and rewards what actor and critic have learned from.
+STATISTICS = ("obs_rms", "ret_rms", "norm_reward")
 
 
 @contextmanager

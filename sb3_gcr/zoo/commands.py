@@ -25,6 +25,7 @@ import numpy as np
 from sb3_gcr import GCRPPO, envs
 from sb3_gcr.simulators.envpool_gym import pool_of
 from sb3_gcr.zoo.components import show_components
+from sb3_gcr.zoo.conflicts import run as run_conflicts
 
 if TYPE_CHECKING:
     import optuna
@@ -50,7 +51,7 @@ ENTROPY_GRID: dict[str, Sequence[Any]] = {
 _PROGRAM = "sb3-gcr-zoo"
 _DESCRIPTION = (
     "Train, tune, play and record with rl-zoo3. The commands are rl-zoo3's, with all their "
-    "options, but for tune_entropy and components."
+    "options, but for tune_entropy, components and conflicts."
 )
 _EPILOG = (
     f"`{_PROGRAM} COMMAND --help` lists the options of a command. `--vec-env batch`, for all but "
@@ -196,13 +197,13 @@ def _entropy_table(study: optuna.Study) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run a command of rl-zoo3, ``tune_entropy`` or ``components``.
+    """Run a command of rl-zoo3, ``tune_entropy``, ``components`` or ``conflicts``.
 
     :param argv: the command and its options; None takes those of the command line
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(_PROGRAM, description=_DESCRIPTION, epilog=_EPILOG)
-    parser.add_argument("command", choices=[*COMMANDS, "tune_entropy", "components"])
+    parser.add_argument("command", choices=[*COMMANDS, "tune_entropy", "components", "conflicts"])
     command = parser.parse_args(arguments[:1]).command
     options = arguments[1:]
     if command == "components":  # needs no rl-zoo3
@@ -222,6 +223,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         given = options
         if "plot" not in command:
             options = _take_vec_env(options, changes)
+        if command == "conflicts":
+            sys.stdout.write(run_conflicts(f"{_PROGRAM} {command}", options))
+            return
         if command == "record_training" and not {"-h", "--help"} & set(options):
             if shutil.which("ffmpeg") is None:
                 parser.exit(
