@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 Observation = NDArray[np.floating[Any]]
 
 
-class HideObservations(gym.ObservationWrapper[Observation, Any, Observation], gym.utils.RecordConstructorArgs):
+class HideObservations(
+    gym.ObservationWrapper[Observation, Any, Observation], gym.utils.RecordConstructorArgs
+):
     """Sets some entries of an observation to 0, always or after the first observations of an
     episode.
 

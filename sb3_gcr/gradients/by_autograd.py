@@ -80,9 +80,15 @@ class ByAutograd:
         """Values V, shape (B, K), and log π(a|s), shape (B,)."""
         with th.enable_grad(), self._hooks.can_be_silenced():
             evaluated = self.policy.evaluate_actions(observations, actions)  # type: ignore[arg-type]
-            self._values, self._log_prob, entropy = evaluated
-            self._entropy_loss = self._log_prob.mean() if entropy is None else -entropy.mean()
-        return self._values.detach(), self._log_prob.detach()
+            return self._keep(*evaluated)
+
+    def _keep(
+        self, values: th.Tensor, log_prob: th.Tensor, entropy: th.Tensor | None
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Keep what was evaluated with its graph, and return it without."""
+        self._values, self._log_prob = values, log_prob
+        self._entropy_loss = log_prob.mean() if entropy is None else -entropy.mean()
+        return values.detach(), log_prob.detach()
 
     def entropy_loss(self) -> th.Tensor:
         """Minus the mean entropy, or the mean log π where the entropy has no closed form."""
