@@ -387,7 +387,8 @@ def test_files_without_plain_settings_are_refused(path: Path) -> None:
         (
             {"counters": {"num_timesteps": "many"}},
             "The counters in a file must be numbers named ['_has_paid', '_n_rollouts_learned', "
-            "'_adaptive_learning_rate', 'num_timesteps', '_n_updates'], found num_timesteps='many'.",
+            "'_adaptive_learning_rate', 'num_timesteps', '_n_updates'], found "
+            "num_timesteps='many'.",
         ),
         (
             {"policy": None},
