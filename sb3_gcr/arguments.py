@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from sb3_gcr.checks import check_flag, check_number
@@ -32,13 +32,17 @@ NUMBERS: dict[str, dict[str, Any]] = {
 FLAGS = ("normalize_advantage", "use_sde")
 
 
-def check_arguments(given: Mapping[str, Any]) -> None:
+def check_arguments(given: Mapping[str, Any], optional: Collection[str] = ()) -> None:
     """Refuse numbers and switches that are none, or out of range.
 
     :param given: by name; what is missing is not checked, other names are ignored
+    :param optional: names of which None is right, too
     :raises TypeError: for text and other things that are no number, or no switch
     :raises ValueError: for a number out of its range
     """
+    given = {
+        name: value for name, value in given.items() if value is not None or name not in optional
+    }
     for name in NUMBERS.keys() & given.keys():
         check_number(name, given[name], **NUMBERS[name])
     for name in FLAGS:

@@ -72,6 +72,9 @@ class ConflictResolution(MultiHead):
         ("_resolver_rng", "seed"),
     )
 
+    #: Arguments of the PPO that may be None, though GCRPPO's may not.
+    optional_arguments: ClassVar[tuple[str, ...]] = ()
+
     batch_size: int
     n_epochs: int
     clip_range: float | Schedule
@@ -125,7 +128,7 @@ class ConflictResolution(MultiHead):
         check_choice("advantage_scope", self.advantage_scope, SCOPES, optional=True)
         check_choice("gramian_method", self.gramian_method, METHODS)
         check_choice("surrogate_clipping", self.surrogate_clipping, CLIPPINGS)
-        check_arguments(vars(self))  # of a loaded model, too
+        check_arguments(vars(self), self.optional_arguments)  # of a loaded model, too
 
     @property
     def _is_scalar_ppo(self) -> bool:

@@ -13,8 +13,11 @@ from typing import Any
 
 import gymnasium as gym
 
+from sb3_gcr.envs.hiding import HideObservations
 from sb3_gcr.envs.tasks.catalogue import TASKS
 from sb3_gcr.simulators.envpool_gym import register_pools
+
+__all__ = ["HideObservations", "register_envs"]
 
 _VEC_ENVS = {"BatchedVecEnv": "sb3_gcr.envs.batched", "EnvPoolVecEnv": "sb3_gcr.simulators.envpool"}
 

@@ -13,14 +13,26 @@ import torch as th
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 
-from sb3_gcr.gradients.by_autograd import (
-    ByAutograd,
-    Jacobian,
-    gramian_by_passes,
-    jacobian_by_passes,
-)
+from sb3_gcr.gradients.by_autograd import ByAutograd, gramian_by_passes, jacobian_by_passes
+from sb3_gcr.gradients.hooks import is_hooked
 from sb3_gcr.gradients.memory import Weights
 from sb3_gcr.recurrent.sequences import Sequences, draw_sequences, take_sequences
+
+
+def leaves_of(output: th.Tensor) -> set[th.Tensor]:
+    """The tensors at the ends of an output's graph, such as the parameters that it depends on."""
+    found = set()
+    seen = set()
+    nodes = [output.grad_fn]
+    while nodes:
+        node = nodes.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if hasattr(node, "variable"):
+            found.add(node.variable)
+        nodes += [following for following, _ in node.next_functions]
+    return found
 
 
 class RecurrentByAutograd(ByAutograd):
@@ -40,6 +52,9 @@ class RecurrentByAutograd(ByAutograd):
     def __init__(self, policy: RecurrentActorCriticPolicy, rng: np.random.Generator):
         super().__init__(policy)
         self._rng = rng
+        self._is_hooked = is_hooked(policy)
+        self._jacobian_rows: th.Tensor | None = None  # J of all sequences, for the step
+        self._actor: list[th.nn.Parameter] = []  # whose numbers are J's columns
 
     def evaluate(  # type: ignore[override]
         self, observations: Sequences, actions: th.Tensor
@@ -51,7 +66,7 @@ class RecurrentByAutograd(ByAutograd):
         """
         self._sequences, self._actions = observations, actions
         valid = observations.valid
-        with th.enable_grad():
+        with th.enable_grad(), self._hooks.can_be_silenced():
             values, log_prob, entropy = self.policy.evaluate_actions(
                 observations.observations,  # type: ignore[arg-type]
                 actions,
@@ -69,16 +84,19 @@ class RecurrentByAutograd(ByAutograd):
         :param n_samples: take whole sequences in random order until they have n valid steps, where
             that costs less than all of them
         """
-        self._jacobian: Jacobian | None = None
-        lengths = self._sequences.lengths
         drawn = self._draw(n_samples, cotangents)
-        if drawn is not None:
-            is_drawn = th.zeros_like(lengths, dtype=th.bool)
-            is_drawn[drawn] = True
-            rows = cotangents[is_drawn.repeat_interleave(lengths)]
-            return gramian_by_passes(self._log_prob_of(drawn), rows, self._parameters)
-        self._jacobian = jacobian_by_passes(self._log_prob, cotangents, self._parameters)
-        return self._jacobian.gramian()
+        self._jacobian_rows = None
+        with self._hooks.silent():
+            if drawn is not None:
+                rows = cotangents[self._sequences.steps_of(drawn)]
+                return gramian_by_passes(self._log_prob_of(drawn), rows, self._parameters)
+            if not self._actor:
+                leaves = leaves_of(self._log_prob)
+                self._actor = [p for p in self._parameters if p in leaves]
+            jacobian = jacobian_by_passes(self._log_prob, cotangents, self._actor)
+        if not self._is_hooked:  # hooks are to see the gradient of the step
+            self._jacobian_rows = jacobian
+        return jacobian @ jacobian.T
 
     def unbiased_gramian(self) -> None:
         """None: the steps of a sequence share their noise, even if they are different samples."""
@@ -106,7 +124,7 @@ class RecurrentByAutograd(ByAutograd):
         n_sequences = len(self._sequences.lengths)
         length = len(sequences.valid) // len(drawn)
         actions = take_sequences(self._actions, n_sequences, drawn, length)
-        with th.enable_grad():
+        with th.enable_grad(), self._hooks.can_be_silenced():
             distribution, _ = self.policy.get_distribution(
                 sequences.observations,  # type: ignore[arg-type]
                 sequences.actor_states,  # type: ignore[arg-type]
@@ -128,11 +146,14 @@ class RecurrentByAutograd(ByAutograd):
         :param value_gradients: of the loss by the values, shape (B, K)
         :param ent_coef: weight of the entropy loss
         """
-        if self._jacobian is None:
-            super().backward(cotangents, weights, value_gradients, ent_coef)
-            return
-        self._log_prob = self._log_prob.detach()  # J has its part already
+        rows = self._jacobian_rows
+        if rows is not None:
+            self._log_prob = self._log_prob.detach()  # J has its part already
         super().backward(cotangents, weights, value_gradients, ent_coef)
+        if rows is None:
+            return
         w = th.as_tensor(weights, dtype=cotangents.dtype, device=cotangents.device)
-        for parameter, gradient in self._jacobian.step(w):
+        step = (w @ rows).split([parameter.numel() for parameter in self._actor])
+        for parameter, part in zip(self._actor, step, strict=True):
+            gradient = part.view_as(parameter)
             parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient

@@ -16,7 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_gcr.multi_head_ppo import MultiHead
+from sb3_gcr.multi_head import MultiHead
 from sb3_gcr.recurrent.buffers import (
     VectorRecurrentDictRolloutBuffer,
     VectorRecurrentRolloutBuffer,
@@ -110,6 +110,13 @@ class MultiHeadRecurrentPPO(MultiHead, RecurrentPPO):
         # The critic has seen the episode up to the step before its terminal observation.
         states: States = tuple(state[:, indices] for state in self._next_lstm_states.vf)
         return self._evaluate(observations, states, np.zeros(len(indices)))
+
+    def _first_value_of(self, observations: PyTorchObs) -> th.Tensor:
+        arrays = observations.values() if isinstance(observations, dict) else [observations]
+        n_observations = len(next(iter(arrays)))
+        n_layers, _, n_units = self.policy.lstm_hidden_state_shape
+        zeros = th.zeros(n_layers, n_observations, n_units, device=self.device)
+        return self._evaluate(observations, (zeros, zeros), np.ones(n_observations))
 
     def _evaluate(
         self, observations: PyTorchObs, states: States, starts: NDArray[Any]

@@ -8,6 +8,7 @@ import torch as th
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
+from sb3_gcr.arguments import check_arguments
 from sb3_gcr.gradients import ActorCritic
 from sb3_gcr.recurrent.by_autograd import RecurrentByAutograd
 from sb3_gcr.recurrent.multi_head_ppo import MultiHeadRecurrentPPO
@@ -44,6 +45,8 @@ class RecurrentGCRPPO(Saving, ConflictResolution, MultiHeadRecurrentPPO):  # typ
         match a loaded model
     """
 
+    optional_arguments = ("batch_size",)  # None is the whole rollout
+
     def __init__(
         self,
         policy: str | type[RecurrentActorCriticPolicy],
@@ -79,6 +82,7 @@ class RecurrentGCRPPO(Saving, ConflictResolution, MultiHeadRecurrentPPO):  # typ
         gramian_samples: int | None = None,
         surrogate_clipping: str = "joint",
     ):
+        check_arguments(locals(), self.optional_arguments)
         super().__init__(
             policy,
             env,

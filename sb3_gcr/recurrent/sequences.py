@@ -36,6 +36,16 @@ class Sequences(NamedTuple):
         """
         return th.zeros(self.valid.shape, device=self.valid.device)
 
+    def steps_of(self, indices: th.Tensor) -> th.Tensor:
+        """Which of the B valid steps belong to some of the sequences, shape (B,).
+
+        :param indices: which, shape (n,)
+        """
+        lengths = self.lengths
+        is_taken = th.zeros_like(lengths, dtype=th.bool)
+        is_taken[indices] = True
+        return is_taken.repeat_interleave(lengths)
+
     def take(self, indices: th.Tensor) -> Sequences:
         """Some of the sequences.
 

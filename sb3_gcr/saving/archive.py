@@ -20,10 +20,10 @@ from stable_baselines3.common.utils import get_device
 
 from sb3_gcr.rewards.spec import SCALAR_REWARD, RewardSpec
 from sb3_gcr.saving.settings import (
-    POLICIES,
     collect_settings,
     describe_object,
     describe_settings,
+    find_policy_name,
     find_settings,
     parse_settings,
     refuse_text,
@@ -76,7 +76,7 @@ def describe_model(
     :param numbers: names of the attributes that are counters and the like
     :param statistics: those of VecNormalize if the env has none
     """
-    policy = POLICIES.get(model.policy_class)
+    policy = find_policy_name(type(model), model.policy_class)
     attributes = model.__dict__
     plain, rest = describe_settings(collect_settings(attributes, find_settings(type(model))))
     if policy is None:
@@ -272,7 +272,7 @@ def read_pickled(
     policy = attributes["policy_class"]
     former = former_settings(attributes, model_class) if "reward_spec" in attributes else {}
     return SavedModel(
-        policy=POLICIES.get(policy, policy),
+        policy=find_policy_name(model_class, policy) or policy,
         spec=attributes.get("reward_spec", SCALAR_REWARD),
         settings={**former, **settings},
         spaces=describe_spaces(attributes["observation_space"], attributes["action_space"]),

@@ -12,32 +12,17 @@ from typing import Any, Union, get_args, get_origin
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
-from stable_baselines3.common.policies import (
-    ActorCriticCnnPolicy,
-    ActorCriticPolicy,
-    MultiInputActorCriticPolicy,
-)
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule
 from torch import nn
 
 from sb3_gcr.checks import text_hint
-from sb3_gcr.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
 #: Arguments of a model's constructor that are no settings.
 NOT_SETTINGS = ("self", "policy", "env", "device", "_init_setup_model")
 #: Those that a file of somebody else has no say in: where to write, and a class.
 PRIVATE = ("tensorboard_log", "rollout_buffer_class")
-#: SB3's policies and ours, by the name that ``GCRPPO(policy)`` takes.
-POLICIES: dict[type[Any], str] = {
-    MlpPolicy: "MlpPolicy",
-    CnnPolicy: "CnnPolicy",
-    MultiInputPolicy: "MultiInputPolicy",
-    ActorCriticPolicy: "MlpPolicy",
-    ActorCriticCnnPolicy: "CnnPolicy",
-    MultiInputActorCriticPolicy: "MultiInputPolicy",
-}
 #: The classes that ``policy_kwargs`` may name.
 _ACTIVATIONS = (
     nn.Tanh,
@@ -93,6 +78,19 @@ def declared(model_class: type[Any], name: str) -> list[Any]:
     """
     bases = reversed(model_class.__mro__)
     return [item for base in bases for item in vars(base).get(name, ())]
+
+
+def find_policy_name(model_class: type[Any], policy_class: type[Any]) -> str | None:
+    """The name by which a model takes a policy, ours or that of the PPO below; None if it has none.
+
+    :param model_class: GCRPPO or a subclass
+    :param policy_class: of the policy
+    """
+    for base in model_class.__mro__:
+        for name, named_class in vars(base).get("policy_aliases", {}).items():
+            if named_class is policy_class:
+                return str(name)
+    return None
 
 
 def _find_parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:

@@ -11,9 +11,10 @@ import torch as th
 
 Parameters = Mapping[str, th.Tensor]
 
-#: The critic's heads, and its layers below; its features extractor too where it has one of its own.
+#: The critic's heads, and its layers below, an LSTM among them; its features extractor too where it
+#: has one of its own.
 HEADS = ("value_net.weight", "value_net.bias")
-HIDDEN = ("mlp_extractor.value_net.", "value_net.")
+HIDDEN = ("mlp_extractor.value_net.", "value_net.", "lstm_critic.", "critic.")
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,8 @@ COMMANDS: dict[str, tuple[str, str | None]] = {
     "plot_from_file": ("rl_zoo3.plots", "plot_from_file"),
     "all_plots": ("rl_zoo3.plots", "all_plots"),
 }
+#: Our algorithms, and those whose settings of rl-zoo3 they take where we have none.
+INHERITED = {"gcrppo": "ppo", "gcrppo_lstm": "ppo_lstm"}
 #: The paper's search: values of the entropy coefficient, and the seeds of each.
 ENTROPY_GRID: dict[str, Sequence[Any]] = {
     "ent_coef": np.geomspace(1e-4, 0.03, 10).tolist(),
@@ -61,7 +63,8 @@ _EPILOG = (
 
 
 def register() -> None:
-    """Make GCRPPO known to rl-zoo3 as ``gcrppo``; its commands then find our hyperparameters, too.
+    """Make GCRPPO and RecurrentGCRPPO known to rl-zoo3 as ``gcrppo`` and ``gcrppo_lstm``; its
+    commands then find our hyperparameters, too.
 
     Call it before ``rl_zoo3.train.train()`` in a script of your own, or in a ``custom_envs.py``,
     which rl-zoo3 imports.
@@ -74,9 +77,13 @@ def register() -> None:
         raise ImportError(
             f"{_PROGRAM} needs rl-zoo3: pip install 'sb3_gcr[zoo]' ({error})"
         ) from error
+    from sb3_gcr.recurrent import RecurrentGCRPPO  # rl-zoo3 brings sb3-contrib
+
     ALGOS["gcrppo"] = GCRPPO
-    hyperparams_opt.HYPERPARAMS_SAMPLER["gcrppo"] = _sample
-    hyperparams_opt.HYPERPARAMS_CONVERTER["gcrppo"] = hyperparams_opt.convert_onpolicy_params
+    ALGOS["gcrppo_lstm"] = RecurrentGCRPPO
+    for algo in INHERITED:
+        hyperparams_opt.HYPERPARAMS_SAMPLER[algo] = _sample
+        hyperparams_opt.HYPERPARAMS_CONVERTER[algo] = hyperparams_opt.convert_onpolicy_params
     if not hasattr(
         exp_manager, "ExperimentManager"
     ):  # rl_zoo3.record_video imports custom_envs.py before that class is there
@@ -89,7 +96,7 @@ def register() -> None:
 def hyperparameter_file(algo: str, env_id: str) -> str | None:
     """Our file of hyperparameters for an algorithm and an env, None where we have none.
 
-    :param algo: "gcrppo" or "ppo"; for others we have none
+    :param algo: "gcrppo", "gcrppo_lstm" or "ppo"; for others we have none
     :param env_id: id of the env
     """
     import yaml
@@ -125,10 +132,8 @@ def _managers() -> tuple[type[ExperimentManager], type[ExperimentManager]]:
         ):
             super().__init__(args, algo, env_id, *others, **kwargs)
             if not kwargs.get("config"):
-                inherited = (
-                    Path(self.config).with_name("ppo.yml") if algo == "gcrppo" else self.config
-                )
-                self.config = hyperparameter_file(algo, env_id) or str(inherited)
+                theirs = Path(self.config).with_name(f"{INHERITED.get(algo, algo)}.yml")
+                self.config = hyperparameter_file(algo, env_id) or str(theirs)
 
         def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
             given, env_id = self.monitor_kwargs, self.env_name.gym_id
