@@ -100,7 +100,7 @@ def test_the_check_leaves_everything_as_it_was(policy_class: Any, observation: s
     policy.value_net = nn.Sequential(norm, nn.Dropout(0.5), policy.value_net)
     np.random.seed(0)
     numpys, torchs = np.random.get_state()[1], th.random.get_rng_state()
-    check_value_heads(policy, 3)
+    check_value_heads(policy, 3, policy.predict_values)
     assert th.equal(th.random.get_rng_state(), torchs)
     np.testing.assert_array_equal(np.random.get_state()[1], numpys)
     assert policy.training
