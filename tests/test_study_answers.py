@@ -249,6 +249,14 @@ def paid(
             "Regularisers paid for nothing: torque -31 -> -31.5.",
         ),
         (
+            [paid(-31, -30, -0.3, 0.36, 0.9)],
+            "No regulariser is shown to have paid: torque -31 -> -30.",
+        ),
+        (
+            [paid(-31, -30, math.nan, math.nan, math.nan)],
+            "No regulariser is shown to have paid: torque -31 -> -30.",
+        ),
+        (
             [paid(-31, -45, -0.6, -0.3, 0.01)],
             "Regularisers paid: torque -31 -> -45.",
         ),

@@ -239,8 +239,8 @@ def _has_paid(term: Paid) -> bool:
 
 
 def _is_spared(term: Paid, margin: float) -> bool:
-    """Whether the return did not fall, or by no more than what does not matter."""
-    return term.after >= term.before or (term.relative and term.low > -margin)
+    """Whether the interval leaves out a fall that matters; without a share, any fall."""
+    return term.low > -margin if term.relative else term.low >= 0.0
 
 
 def _arrows(terms: Sequence[Paid]) -> str:
