@@ -385,8 +385,11 @@ def test_regulariser_weight_multiplies_the_regularisers_alone() -> None:
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray")
 @pytest.mark.filterwarnings("ignore")
-def test_ray_gives_the_same_numbers(tmp_path: Path, results: Mapping[str, Any]) -> None:
+def test_ray_gives_the_same_numbers(
+    tmp_path: Path, results: Mapping[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The same scalars as in this process; a cell whose process crashes is named."""
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 by default: nothing on a busy machine
     import ray
 
     from sb3_gcr.study.engines import RayEngine
