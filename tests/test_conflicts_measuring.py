@@ -111,6 +111,17 @@ def test_every_policy_is_measured(
     assert np.isfinite(found.z).all()
 
 
+def test_a_policy_with_memory_is_measured() -> None:
+    pytest.importorskip("sb3_contrib")
+    from sb3_gcr.recurrent import RecurrentGCRPPO
+
+    kwargs = {**KWARGS, "policy_kwargs": {"net_arch": [8], "lstm_hidden_size": 4}}
+    model = RecurrentGCRPPO("MlpLstmPolicy", make_env(), **kwargs)
+    found = measure_conflicts(model, make_env(), n_rollouts=3)
+    assert np.isfinite(found.z).all()
+    assert (found.estimate.squared_norms > 0).all()
+
+
 def test_a_loaded_model_needs_no_env_of_its_own(tmp_path: Any) -> None:
     model = GCRPPO("MlpPolicy", make_env(normalise=True), **KWARGS)
     model.learn(64)
@@ -171,7 +182,7 @@ def test_what_cannot_be_measured_is_refused() -> None:
         measure_conflicts(model, make_env(spec=others))
     with pytest.raises(ValueError, match="must be another env than the model's own"):
         measure_conflicts(model, model.get_env())  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="must be a GCRPPO or SB3's PPO, found A2C"):
+    with pytest.raises(TypeError, match="a RecurrentGCRPPO or SB3's PPO, found A2C"):
         measure_conflicts(A2C("MlpPolicy", make_env()), make_env())  # type: ignore[arg-type]
 
 
