@@ -13,9 +13,11 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_gcr import GCRPPO, RewardSpec, measure_conflicts
+from sb3_gcr.conflicts.estimators import Estimate
 from sb3_gcr.conflicts.heads import Rollout, fit_heads
 from sb3_gcr.conflicts.measuring import rollout_gradients
-from tests.envs import Env, Valley
+from sb3_gcr.conflicts.result import Conflicts
+from tests.envs import SPEC, Env, Valley
 
 KWARGS: dict[str, Any] = {
     "n_steps": 32,
@@ -89,6 +91,25 @@ def whole_state(model: Any) -> list[Any]:
     generators = [random.getstate(), np.random.get_state()[1].tolist(), th.get_rng_state().tolist()]  # type: ignore[union-attr]
     counters = [model.num_timesteps, model._n_updates, model.policy.training]
     return [stream.getvalue(), statistics, generators, counters, model._last_obs.tolist()]
+
+
+@pytest.mark.parametrize(("z", "verb"), [(-3.5, "really conflict"), (-2.5, "may conflict")])
+def test_a_sentence_for_each_pair_that_matters(z: float, verb: str) -> None:
+    gramian = np.array([[1.0, -0.5, 0.0], [-0.5, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    errors = np.array([[0.1, -0.5 / z, 0.1], [-0.5 / z, 0.1, 0.1], [0.1, 0.1, 0.9]])
+    found = Conflicts(SPEC, Estimate(gramian, errors, np.ones(3)), gramian, 24)
+    assert found.sentences() == [
+        f"go and stay {verb}: −0.50, z = −{-z}.",
+        "save has no signal yet.",
+    ]
+    assert [pair.second for pair in found.pairs()] == ["stay", "save", "save"]
+
+
+def test_a_pair_that_may_be_one_term() -> None:
+    gramian = np.array([[1.0, 0.95], [0.95, 1.0]])
+    spec = RewardSpec(("walk", "run"), (0, 0))
+    found = Conflicts(spec, Estimate(gramian, gramian / 9.5, np.ones(2)), gramian, 24)
+    assert found.sentences() == ["walk and run want the same: 0.95, z = 9.5."]
 
 
 @pytest.mark.parametrize(
