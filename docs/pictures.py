@@ -30,7 +30,7 @@ LEVELS = np.array([0, 0, 1])
 #: Pairs of HumanoidRun in the picture of noise.
 NOISE_PAIRS = (
     ("alive", "joint_pos_limits"),
-    ("move_to_target", "energy"),
+    ("progress", "joint_pos_limits"),
     ("progress", "action_l2"),
 )
 BLUE, ORANGE, GREY, RED = "#1f6fb4", "#d9730d", "#8a8a8a", "#b3261e"

@@ -13,9 +13,11 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_gcr import GCRPPO, RewardSpec, measure_conflicts
+from sb3_gcr.conflicts.estimators import Estimate
 from sb3_gcr.conflicts.heads import Rollout, fit_heads
 from sb3_gcr.conflicts.measuring import rollout_gradients
-from tests.envs import Env, Valley
+from sb3_gcr.conflicts.result import Conflicts
+from tests.envs import SPEC, Env, Valley
 
 KWARGS: dict[str, Any] = {
     "n_steps": 32,
@@ -91,6 +93,25 @@ def whole_state(model: Any) -> list[Any]:
     return [stream.getvalue(), statistics, generators, counters, model._last_obs.tolist()]
 
 
+@pytest.mark.parametrize(("z", "verb"), [(-3.5, "really conflict"), (-2.5, "may conflict")])
+def test_a_sentence_for_each_pair_that_matters(z: float, verb: str) -> None:
+    gramian = np.array([[1.0, -0.5, 0.0], [-0.5, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    errors = np.array([[0.1, -0.5 / z, 0.1], [-0.5 / z, 0.1, 0.1], [0.1, 0.1, 0.9]])
+    found = Conflicts(SPEC, Estimate(gramian, errors, np.ones(3)), gramian, 24)
+    assert found.sentences() == [
+        f"go and stay {verb}: −0.50, z = −{-z}.",
+        "save has no signal yet.",
+    ]
+    assert [pair.second for pair in found.pairs()] == ["stay", "save", "save"]
+
+
+def test_a_pair_that_may_be_one_term() -> None:
+    gramian = np.array([[1.0, 0.95], [0.95, 1.0]])
+    spec = RewardSpec(("walk", "run"), (0, 0))
+    found = Conflicts(spec, Estimate(gramian, gramian / 9.5, np.ones(2)), gramian, 24)
+    assert found.sentences() == ["walk and run want the same: 0.95, z = 9.5."]
+
+
 @pytest.mark.parametrize(
     ("policy", "observation", "action", "kwargs"),
     [
@@ -109,6 +130,17 @@ def test_every_policy_is_measured(
     found = measure_conflicts(model, make_env(**spaces), n_rollouts=3)
     assert found.cosines.shape == (3, 3)
     assert np.isfinite(found.z).all()
+
+
+def test_a_policy_with_memory_is_measured() -> None:
+    pytest.importorskip("sb3_contrib")
+    from sb3_gcr.recurrent import RecurrentGCRPPO
+
+    kwargs = {**KWARGS, "policy_kwargs": {"net_arch": [8], "lstm_hidden_size": 4}}
+    model = RecurrentGCRPPO("MlpLstmPolicy", make_env(), **kwargs)
+    found = measure_conflicts(model, make_env(), n_rollouts=3)
+    assert np.isfinite(found.z).all()
+    assert (found.estimate.squared_norms > 0).all()
 
 
 def test_a_loaded_model_needs_no_env_of_its_own(tmp_path: Any) -> None:
@@ -171,7 +203,7 @@ def test_what_cannot_be_measured_is_refused() -> None:
         measure_conflicts(model, make_env(spec=others))
     with pytest.raises(ValueError, match="must be another env than the model's own"):
         measure_conflicts(model, model.get_env())  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="must be a GCRPPO or SB3's PPO, found A2C"):
+    with pytest.raises(TypeError, match="a RecurrentGCRPPO or SB3's PPO, found A2C"):
         measure_conflicts(A2C("MlpPolicy", make_env()), make_env())  # type: ignore[arg-type]
 
 

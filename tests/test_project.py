@@ -113,6 +113,7 @@ ARROWS = {
         "rewards.reading",
         "saving.model",
         "saving.statistics",
+        "update",
     },
     "logs.__init__": set(),
     "logs.figures": {

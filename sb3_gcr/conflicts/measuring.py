@@ -15,6 +15,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from torch.nn import RNNBase
 
 from sb3_gcr.checks import check_number
 from sb3_gcr.conflicts.blocks import Blocks
@@ -34,13 +35,14 @@ from sb3_gcr.rewards.layers import layers_of
 from sb3_gcr.rewards.reading import find_reward_spec
 from sb3_gcr.saving.model import Saving
 from sb3_gcr.saving.statistics import ONE_OBSERVATION, count_seen
+from sb3_gcr.update import ConflictResolution
 
 #: Samples whose graph is in memory at a time.
 CHUNK = 4096
 
 
 def measure_conflicts(
-    model: PPO,
+    model: PPO | ConflictResolution,
     env: gym.Env[Any, Any] | VecEnv,
     n_rollouts: int = 24,
     seed: int | None = None,
@@ -62,7 +64,7 @@ def measure_conflicts(
     SB3's ``PPO`` has one value head, so one for each term is fitted first to four more rollouts, on
     the features of its critic.
 
-    :param model: a GCRPPO, or SB3's PPO; trained or loaded
+    :param model: a GCRPPO, a RecurrentGCRPPO, or SB3's PPO; trained or loaded
     :param env: another env than the model's own, with the same reward terms
     :param n_rollouts: number of blocks, of ``model.n_steps`` steps of every env each; at least 3
     :param seed: of the copy and of ``env``; None goes on with the generators as they are
@@ -73,9 +75,10 @@ def measure_conflicts(
     :raises TypeError: for another algorithm than PPO
     """
     check_number("n_rollouts", n_rollouts, MIN_BLOCKS, integer=True)
-    if not isinstance(model, PPO):
+    if not isinstance(model, PPO | ConflictResolution):
         raise TypeError(
-            f"Parameter `model` must be a GCRPPO or SB3's PPO, found {type(model).__name__}."
+            "Parameter `model` must be a GCRPPO, a RecurrentGCRPPO or SB3's PPO, found "
+            f"{type(model).__name__}."
         )
     venv = BaseAlgorithm._wrap_env(env, 0)
     _check_env(model, venv)
@@ -90,7 +93,7 @@ def measure_conflicts(
         return _measure(copy, n_rollouts, not isinstance(model, Saving), progress_bar)
 
 
-def _check_env(model: PPO, env: VecEnv) -> None:
+def _check_env(model: PPO | ConflictResolution, env: VecEnv) -> None:
     """Refuse an env that cannot tell terms apart, or whose episodes training would miss."""
     spec = find_reward_spec(env)
     if spec is None:
@@ -127,7 +130,7 @@ def _simulations(env: VecEnv) -> set[int]:
     return {id(innermost), *(id(one.unwrapped) for one in single)}
 
 
-def _copy(model: PPO, env: VecEnv, seed: int | None) -> GCRPPO:
+def _copy(model: PPO | ConflictResolution, env: VecEnv, seed: int | None) -> ConflictResolution:
     """A model of the same policy on another env, which prints and logs nothing."""
     stream = io.BytesIO()
     model.save(stream)
@@ -142,7 +145,9 @@ def _copy(model: PPO, env: VecEnv, seed: int | None) -> GCRPPO:
     return copy  # type: ignore[no-any-return]
 
 
-def _measure(model: GCRPPO, n_rollouts: int, fits_heads: bool, progress_bar: bool) -> Conflicts:
+def _measure(
+    model: ConflictResolution, n_rollouts: int, fits_heads: bool, progress_bar: bool
+) -> Conflicts:
     """Collect the rollouts and multiply their gradients."""
     assert model.env is not None
     env, buffer = model.env, model.rollout_buffer
@@ -162,7 +167,7 @@ def _measure(model: GCRPPO, n_rollouts: int, fits_heads: bool, progress_bar: boo
     return Conflicts(model.reward_spec, estimate(products), naive, len(products))
 
 
-def rollout_gradients(model: GCRPPO, chunk: int = CHUNK) -> NDArray[np.float32]:
+def rollout_gradients(model: ConflictResolution, chunk: int = CHUNK) -> NDArray[np.float32]:
     """The K policy gradients of the rollout in a model's buffer, at the policy that made it.
 
     Its advantages lose their means.
@@ -174,8 +179,10 @@ def rollout_gradients(model: GCRPPO, chunk: int = CHUNK) -> NDArray[np.float32]:
     buffer = model.rollout_buffer
     buffer.advantages = buffer.advantages - buffer.advantages.mean((0, 1))
     n_samples = buffer.advantages[..., 0].size
-    actor_critic = ByAutograd(model.policy)
-    model.policy.set_training_mode(False)
+    chosen = model._choose_actor_critic()
+    actor_critic = chosen if isinstance(chosen, ByAutograd) else ByAutograd(model.policy)
+    # As in the rollout; but CUDA's recurrent layers have a backward pass in training alone.
+    model.policy.set_training_mode(any(isinstance(m, RNNBase) for m in model.policy.modules()))
     total: Any = 0.0
     batches = minibatches(
         buffer,

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+#: Of many pairs some are beyond two standard errors by chance; beyond so many hardly any.
+REALLY = 3.0
 #: A pair with a cosine from here on may as well be one term.
 ALIKE = 0.9
 
@@ -130,7 +132,9 @@ def _sentence(pair: Pair) -> str | None:
     if np.isnan(pair.cosine):
         return None
     figures = f"{pair.cosine:.2f}, z = {pair.z:.1f}".replace("-", "\N{MINUS SIGN}")
-    if pair.z < -CERTAIN:
+    if -REALLY <= pair.z < -CERTAIN:
+        return f"{pair.first} and {pair.second} may conflict: {figures}."
+    if pair.z < -REALLY:
         return f"{pair.first} and {pair.second} really conflict: {figures}."
     if pair.z > CERTAIN and pair.cosine >= ALIKE:
         return f"{pair.first} and {pair.second} want the same: {figures}."
