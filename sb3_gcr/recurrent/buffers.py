@@ -30,7 +30,7 @@ class _SequenceBuffer(ComponentBuffer):
         padded: Any = super()._get_samples(batch_inds, env_change, env)  # type: ignore[call-arg, arg-type]
         return RolloutBufferSamples(
             observations=self._to_sequences(padded),  # type: ignore[arg-type]
-            actions=padded.actions,
+            actions=padded.actions.float(),  # as SB3's buffers, for MultiBinary
             old_values=self.to_torch(self.values[batch_inds]),
             old_log_prob=self.to_torch(self.log_probs[batch_inds]).flatten(),
             advantages=self.to_torch(self.advantages[batch_inds]),
