@@ -148,7 +148,9 @@ def test_gramian_and_step_are_those_of_the_sequences_one_by_one(model: Any) -> N
     networks.backward(cotangents, weights.numpy(), th.zeros_like(cotangents), 0.0)
     step = th.cat([p.grad.flatten() for p in parameters if p.grad is not None])
     th.testing.assert_close(step, sum(w * r for w, r in zip(weights, rows, strict=True)))
-    assert networks.entropy_loss() == pytest.approx(-float(th.cat(entropies).detach().mean()), rel=1e-5)
+    assert networks.entropy_loss() == pytest.approx(
+        -float(th.cat(entropies).detach().mean()), rel=1e-5
+    )
 
 
 def is_actor(name: str) -> bool:

@@ -29,7 +29,7 @@ from sb3_gcr.rewards.decomposition import GYMNASIUM_ENVS
 from sb3_gcr.simulators.envpool import ENVPOOL_ENVS
 from sb3_gcr.simulators.envpool_gym import pool_of
 from sb3_gcr.zoo import commands as zoo
-from sb3_gcr.zoo import main
+from sb3_gcr.zoo import hyperparameter_file, main
 
 if (
     importlib.util.find_spec("rl_zoo3") is None
@@ -97,9 +97,9 @@ def test_files_have_every_env_and_differ_only_where_they_must() -> None:
         assert settings.get("env_wrapper") == (
             None if env_id in ours else "sb3_gcr.RewardDecomposition"
         )
-    assert zoo.hyperparameter_file("ppo", "Humanoid-v5")
-    assert not zoo.hyperparameter_file("ppo", "CartPole-v1")
-    assert not zoo.hyperparameter_file("sac", "Humanoid-v5")
+    assert hyperparameter_file("ppo", "Humanoid-v5")
+    assert not hyperparameter_file("ppo", "CartPole-v1")
+    assert not hyperparameter_file("sac", "Humanoid-v5")
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_every_entry_makes_a_model(algo: str, env_id: str, monkeypatch: pytest.M
     if env_id not in gym.registry:
         pytest.skip("not registered yet")
     zoo.register()
-    manager_class = zoo._managers()[0]
+    manager_class = importlib.import_module("sb3_gcr.zoo.managers").ZooManager
     if env_id.startswith("envpool/"):
         pytest.importorskip("envpool")
         monkeypatch.setattr(manager_class, "default_vec_env_cls", staticmethod(pool_of))
@@ -394,7 +394,8 @@ def test_optimize_searches_the_resolver_too(capsys: pytest.CaptureFixture[str]) 
 def test_tune_entropy_gives_every_value_all_seeds(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert np.round(zoo.ENTROPY_GRID["ent_coef"], 8).tolist() == [
+    search = importlib.import_module("sb3_gcr.zoo.entropy_search")
+    assert np.round(search.ENTROPY_GRID["ent_coef"], 8).tolist() == [
         *(0.0001, 0.00018847, 0.0003552, 0.00066943, 0.00126166),  # the numbers of the paper
         *(0.00237782, 0.0044814, 0.00844598, 0.01591789, 0.03),
     ]
@@ -406,7 +407,7 @@ def test_tune_entropy_gives_every_value_all_seeds(
         return learn(model, 128, **kwargs)
 
     monkeypatch.setattr(GCRPPO, "learn", count)
-    monkeypatch.setattr(zoo, "ENTROPY_GRID", {"ent_coef": [1e-4, 3e-2], "seed": [0, 1]})
+    monkeypatch.setattr(search, "ENTROPY_GRID", {"ent_coef": [1e-4, 3e-2], "seed": [0, 1]})
     command = ["tune_entropy", "--algo", "gcrppo", "--env", "Swimmer-v5", "--eval-episodes", "1"]
     command += [
         "--env-kwargs",

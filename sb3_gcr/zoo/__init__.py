@@ -1,5 +1,6 @@
 """rl-zoo3's commands for GCRPPO."""
 
-from sb3_gcr.zoo.commands import hyperparameter_file, main, register
+from sb3_gcr.zoo.commands import main, register
+from sb3_gcr.zoo.hyperparameters import hyperparameter_file
 
 __all__ = ["hyperparameter_file", "main", "register"]

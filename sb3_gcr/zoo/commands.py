@@ -12,25 +12,20 @@ import runpy
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from importlib import import_module
-from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import gymnasium as gym
-import numpy as np
 
 from sb3_gcr import GCRPPO, envs
 from sb3_gcr.simulators.envpool_gym import pool_of
 from sb3_gcr.zoo.components import show_components
 from sb3_gcr.zoo.conflicts import run as run_conflicts
+from sb3_gcr.zoo.hyperparameters import INHERITED
+from sb3_gcr.zoo.patches import patched
 
 if TYPE_CHECKING:
     import optuna
-    from rl_zoo3.exp_manager import ExperimentManager
-    from stable_baselines3.common.vec_env import VecEnv
 
 #: Where rl-zoo3 has each command; None for a module that is a script.
 COMMANDS: dict[str, tuple[str, str | None]] = {
@@ -41,13 +36,6 @@ COMMANDS: dict[str, tuple[str, str | None]] = {
     "plot_train": ("rl_zoo3.plots", "plot_train"),
     "plot_from_file": ("rl_zoo3.plots", "plot_from_file"),
     "all_plots": ("rl_zoo3.plots", "all_plots"),
-}
-#: Our algorithms, and those whose settings of rl-zoo3 they take where we have none.
-INHERITED = {"gcrppo": "ppo", "gcrppo_lstm": "ppo_lstm"}
-#: The paper's search: values of the entropy coefficient, and the seeds of each.
-ENTROPY_GRID: dict[str, Sequence[Any]] = {
-    "ent_coef": np.geomspace(1e-4, 0.03, 10).tolist(),
-    "seed": [0, 1, 2],
 }
 
 _PROGRAM = "sb3-gcr-zoo"
@@ -84,25 +72,14 @@ def register() -> None:
     for algo in INHERITED:
         hyperparams_opt.HYPERPARAMS_SAMPLER[algo] = _sample
         hyperparams_opt.HYPERPARAMS_CONVERTER[algo] = hyperparams_opt.convert_onpolicy_params
-    if not hasattr(
-        exp_manager, "ExperimentManager"
-    ):  # rl_zoo3.record_video imports custom_envs.py before that class is there
+    # rl_zoo3.record_video imports custom_envs.py before that class is there.
+    if not hasattr(exp_manager, "ExperimentManager"):
         return
+    from sb3_gcr.zoo.managers import ZooManager
+
     for name in ("exp_manager", "train", "enjoy"):
         if f"rl_zoo3.{name}" in sys.modules:
-            sys.modules[f"rl_zoo3.{name}"].ExperimentManager = _managers()[0]  # type: ignore[attr-defined]
-
-
-def hyperparameter_file(algo: str, env_id: str) -> str | None:
-    """Our file of hyperparameters for an algorithm and an env, None where we have none.
-
-    :param algo: "gcrppo", "gcrppo_lstm" or "ppo"; for others we have none
-    :param env_id: id of the env
-    """
-    import yaml
-
-    path = files("sb3_gcr.hyperparams") / f"{algo}.yml"
-    return str(path) if path.is_file() and env_id in yaml.safe_load(path.read_text()) else None
+            sys.modules[f"rl_zoo3.{name}"].ExperimentManager = ZooManager  # type: ignore[attr-defined]
 
 
 def _sample(
@@ -113,92 +90,6 @@ def _sample(
 
     resolver = trial.suggest_categorical("resolver", ["gcr", "guaranteed"])
     return {**sample_ppo_params(trial, n_actions, n_envs, additional_args), "resolver": resolver}
-
-
-@functools.cache
-def _managers() -> tuple[type[ExperimentManager], type[ExperimentManager]]:
-    """rl-zoo3's manager of experiments for ``train`` and for ``tune_entropy``; a function, because
-    rl-zoo3 is optional.
-    """
-    import optuna
-    from rl_zoo3 import ALGOS, exp_manager
-    from stable_baselines3.common.utils import set_random_seed
-
-    class ZooManager(exp_manager.ExperimentManager):
-        """Finds our hyperparameters, and lets Monitor write the return of each term of our envs."""
-
-        def __init__(
-            self, args: argparse.Namespace, algo: str, env_id: str, *others: Any, **kwargs: Any
-        ):
-            super().__init__(args, algo, env_id, *others, **kwargs)
-            if not kwargs.get("config"):
-                theirs = Path(self.config).with_name(f"{INHERITED.get(algo, algo)}.yml")
-                self.config = hyperparameter_file(algo, env_id) or str(theirs)
-
-        def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-            given, env_id = self.monitor_kwargs, self.env_name.gym_id
-            if gym.spec(env_id).namespace in ("sb3_gcr", "envpool"):
-                env = gym.make(env_id, **(self.eval_env_kwargs if eval_env else self.env_kwargs))
-                self.monitor_kwargs = {
-                    "info_keywords": env.get_wrapper_attr("reward_spec").return_keys,
-                    **given,
-                }
-                env.close()
-            try:
-                return super().create_envs(n_envs, eval_env, no_log)
-            finally:
-                self.monitor_kwargs = given
-
-    class EntropyManager(ZooManager):
-        """Gives each entropy coefficient of the grid several seeds and half the budget."""
-
-        def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
-            is_given = self.n_timesteps > 0
-            result = super()._preprocess_hyperparams(hyperparams)
-            self.n_timesteps = self.n_timesteps if is_given else self.n_timesteps // 2
-            return result
-
-        def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
-            return optuna.samplers.GridSampler(ENTROPY_GRID)
-
-        def objective(self, trial: optuna.Trial) -> float:
-            self.study, algorithm = trial.study, ALGOS[self.algo]
-            if self.study.sampler.is_exhausted(self.study):  # type: ignore[union-attr]
-                self.study.stop()
-                raise optuna.TrialPruned
-            values, seeds = ENTROPY_GRID["ent_coef"], ENTROPY_GRID["seed"]
-            chosen = {"ent_coef": trial.suggest_float("ent_coef", values[0], values[-1], log=True)}
-            self.seed = trial.suggest_int("seed", seeds[0], seeds[-1])
-            set_random_seed(self.seed)
-            seeded = {self.algo: lambda **kwargs: algorithm(**{**kwargs, "seed": self.seed})}
-            with (
-                _set(exp_manager, "HYPERPARAMS_SAMPLER", {self.algo: lambda *_: chosen}),
-                _set(exp_manager, "ALGOS", seeded),
-            ):
-                return super().objective(trial)
-
-        def hyperparameters_optimization(self) -> None:
-            super().hyperparameters_optimization()
-            sys.stdout.write(_entropy_table(self.study))
-
-    return ZooManager, EntropyManager
-
-
-def _entropy_table(study: optuna.Study) -> str:
-    """The mean return of each entropy coefficient, and the best of those that have all seeds."""
-    returns: dict[float, dict[int, float]] = {value: {} for value in ENTROPY_GRID["ent_coef"]}
-    for trial in study.trials:
-        if trial.state.name == "COMPLETE" and trial.value is not None:
-            returns[trial.params["ent_coef"]][trial.params["seed"]] = trial.value
-    means = {value: sum(found.values()) / len(found) for value, found in returns.items() if found}
-    lines = ["  ent_coef        return  seeds"]
-    lines += [
-        f"{value:10.6f}  {mean:12.2f}  {len(returns[value]):5}" for value, mean in means.items()
-    ]
-    whole = [value for value in means if len(returns[value]) == len(ENTROPY_GRID["seed"])]
-    if whole:
-        lines.append(f"Best entropy coefficient: {max(whole, key=means.__getitem__):.6f}")
-    return "\n".join(lines) + "\n"
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -219,12 +110,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     except ImportError as error:
         parser.exit(2, f"{error}\n")
     with ExitStack() as changes:
-        changes.enter_context(_set(sys, "argv", [f"{_PROGRAM} {command}"]))
+        changes.enter_context(patched(sys, "argv", [f"{_PROGRAM} {command}"]))
         if command == "tune_entropy":
+            from sb3_gcr.zoo.entropy_search import EntropyManager, entropy_arguments
+
             changes.enter_context(
-                _set(import_module("rl_zoo3.train"), "ExperimentManager", _managers()[1])
+                patched(import_module("rl_zoo3.train"), "ExperimentManager", EntropyManager)
             )
-            command, options = "train", _entropy_arguments(options)
+            command, options = "train", entropy_arguments(_PROGRAM, options)
         given = options
         if "plot" not in command:
             options = _take_vec_env(options, changes)
@@ -241,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             call = functools.partial(
                 _call_us, subprocess.call, ["--vec-env", "batch"] if options != given else []
             )
-            changes.enter_context(_set(subprocess, "call", call))
+            changes.enter_context(patched(subprocess, "call", call))
         sys.argv += options
         module, function = COMMANDS[command]
         if function is None:
@@ -269,14 +162,14 @@ def _take_vec_env(options: list[str], changes: ExitStack) -> list[str]:
         )
     import rl_zoo3.utils
 
+    from sb3_gcr.zoo.managers import ZooManager
+
     make: Any = envs.BatchedVecEnv if env_id.startswith("sb3_gcr/") else pool_of
-    changes.enter_context(
-        _set(_managers()[0], "default_vec_env_cls", staticmethod(make))
-    )  # a function is no method there
+    # A function is no method there.
+    changes.enter_context(patched(ZooManager, "default_vec_env_cls", staticmethod(make)))
     create = functools.partial(rl_zoo3.utils.create_test_env, vec_env_cls=make)
-    changes.enter_context(
-        _set(rl_zoo3.utils, "create_test_env", create)
-    )  # record_video names no class
+    # record_video names no class.
+    changes.enter_context(patched(rl_zoo3.utils, "create_test_env", create))
     return rest
 
 
@@ -285,65 +178,6 @@ def _call_us(call: Callable[[list[str]], int], vec_env: list[str], command: list
     does not know GCRPPO.
     """
     return call([sys.executable, "-m", "sb3_gcr.zoo", "record_video", *vec_env, *command[3:]])
-
-
-def _entropy_arguments(arguments: list[str]) -> list[str]:
-    """What ``rl_zoo3.train`` needs to search the entropy coefficient."""
-    parser = argparse.ArgumentParser(
-        allow_abbrev=False,
-        description=(
-            "Search the entropy coefficient as the paper does: 10 values from 1e-4 to 0.03, 3 "
-            "seeds each, half the budget. Several machines can take part: start the same command "
-            "on each."
-        ),
-        epilog=(
-            f"All other options are those of `{_PROGRAM} train`; with `-n` the budget of each run "
-            "is as given."
-        ),
-    )
-    parser.add_argument("--algo", required=True, help="one study per algorithm")
-    parser.add_argument("--env", required=True, help="and per env")
-    parser.add_argument(
-        "-f", "--log-folder", default="logs", help="where the report goes (default: logs)"
-    )
-    parser.add_argument(
-        "--storage",
-        help="of Optuna: a .log file or a database (default: entropy.log in the log folder)",
-    )
-    parser.add_argument("--study-name", help="(default: entropy-ALGO-ENV)")
-    parser.add_argument(
-        "--n-jobs", type=int, choices=[1], help="1: start the command several times instead"
-    )
-    options, rest = parser.parse_known_args(arguments)
-    storage = options.storage or str(Path(options.log_folder) / "entropy.log")
-    study = options.study_name or f"entropy-{options.algo}-{options.env}"
-    return [
-        *("-optimize", "--algo", options.algo, "--env", options.env, "-f", options.log_folder),
-        *(
-            "--storage",
-            storage,
-            "--study-name",
-            study,
-            "--pruner",
-            "none",
-            "--n-evaluations",
-            "1",
-            "--eval-episodes",
-            "20",
-        ),
-        *rest,
-    ]
-
-
-@contextmanager
-def _set(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Set an attribute for a while."""
-    before = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, before)
 
 
 if __name__ == "__main__":
