@@ -12,11 +12,21 @@ from pathlib import Path
 import torch as th
 from tqdm import tqdm
 
-from benchmarks import gpu, learning, memory, parts, report, simulations, updates
+from benchmarks import (
+    gpu,
+    learning,
+    memory,
+    parts,
+    recurrent,
+    report,
+    simulations,
+    updates,
+)
 from benchmarks.measuring import Case, Row, measure_pairs, missing
 
 GROUPS = {
     "update": updates.cases,
+    "recurrent": recurrent.cases,
     "learn": learning.cases,
     "memory": memory.cases,
     "parts": parts.cases,

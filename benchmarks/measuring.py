@@ -25,6 +25,7 @@ NEEDS = {
     "sbx": "sbx is not installed: pip install 'sb3_gcr[bench]'.",
     "torchjd": "TorchJD is not installed: pip install 'sb3_gcr[torchjd]'.",
     "envpool": "EnvPool is not installed: pip install 'sb3_gcr[envpool]'.",
+    "sb3_contrib": "sb3-contrib is not installed: pip install 'sb3_gcr[recurrent]'.",
     "cuda": "torch.cuda.is_available() is False.",
 }
 

@@ -20,6 +20,7 @@ PACKAGES = (
     "sb3_gcr",
     "torch",
     "stable_baselines3",
+    "sb3_contrib",
     "numpy",
     "gymnasium",
     "mujoco",

@@ -21,7 +21,7 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from sb3_gcr.gradients.by_autograd import ByAutograd
 from sb3_gcr.recurrent import RecurrentGCRPPO
 from sb3_gcr.recurrent.by_autograd import RecurrentByAutograd, leaves_of
-from sb3_gcr.recurrent.sequences import Sequences, draw_sequences, take_sequences
+from sb3_gcr.recurrent.sequences import Sequences, draw_sequences, lay_out, take_sequences
 
 LSTM: dict[str, Any] = {"lstm_hidden_size": 6, "net_arch": [5]}
 SEPARATE = LSTM
@@ -322,6 +322,16 @@ def test_sequences_are_taken_and_cut_to_the_longest() -> None:
     assert taken.actor_states[0].flatten().tolist() == [1.0, 3.0]
     assert taken.critic_states[0].flatten().tolist() == [4.0, 6.0]
     assert sequences.steps_of(th.tensor([1])).tolist() == [0, 0, 0, 1, 1, 1, 1, 0, 0]
+
+
+def test_a_minibatch_is_cut_where_sequences_begin() -> None:
+    begins = np.array([False, False, True, False, False, True])
+    layout = lay_out(begins)
+    assert layout.firsts.tolist() == [0, 2, 5]
+    assert layout.steps.tolist() == [[0, 1, 1], [2, 3, 4], [5, 5, 5]]
+    assert layout.valid.tolist() == [[True, True, False], [True] * 3, [True, False, False]]
+    alone = lay_out(np.array([False]))
+    assert (alone.firsts.tolist(), alone.steps.tolist()) == ([0], [[0]])
 
 
 def test_the_leaves_of_an_output_are_what_it_depends_on() -> None:

@@ -8,10 +8,10 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from sb3_contrib.common.recurrent.buffers import RecurrentDictRolloutBuffer, RecurrentRolloutBuffer
-from stable_baselines3.common.type_aliases import RolloutBufferSamples
+from stable_baselines3.common.type_aliases import PyTorchObs, RolloutBufferSamples
 
 from sb3_gcr.buffers import ComponentBuffer
-from sb3_gcr.recurrent.sequences import Sequences, States
+from sb3_gcr.recurrent.sequences import Sequences, States, lay_out
 
 
 class _SequenceBuffer(ComponentBuffer):
@@ -27,27 +27,43 @@ class _SequenceBuffer(ComponentBuffer):
     def _get_samples(  # type: ignore[override]
         self, batch_inds: NDArray[np.int_], env_change: NDArray[Any], env: Any = None
     ) -> RolloutBufferSamples:
-        padded: Any = super()._get_samples(batch_inds, env_change, env)  # type: ignore[call-arg, arg-type]
+        begins_episode = self.episode_starts[batch_inds, 0] > 0
+        layout = lay_out(begins_episode | (env_change[batch_inds, 0] > 0))
+        steps = batch_inds[layout.steps.flatten()]
         return RolloutBufferSamples(
-            observations=self._to_sequences(padded),  # type: ignore[arg-type]
-            actions=padded.actions.float(),  # as SB3's buffers, for MultiBinary
-            old_values=self.to_torch(self.values[batch_inds]),
-            old_log_prob=self.to_torch(self.log_probs[batch_inds]).flatten(),
-            advantages=self.to_torch(self.advantages[batch_inds]),
-            returns=self.to_torch(self.returns[batch_inds]),
+            observations=Sequences(  # type: ignore[arg-type]
+                observations=self._observations_at(steps),
+                actor_states=self._states_at("pi", batch_inds, layout.firsts),
+                critic_states=self._states_at("vf", batch_inds, layout.firsts),
+                valid=self.to_torch(layout.valid.flatten(), copy=False),
+            ),
+            actions=self._to_floats(self.actions[steps]),  # as SB3's buffers, for MultiBinary
+            old_values=self._to_floats(self.values[batch_inds]),
+            old_log_prob=self._to_floats(self.log_probs[batch_inds]).flatten(),
+            advantages=self._to_floats(self.advantages[batch_inds]),
+            returns=self._to_floats(self.returns[batch_inds]),
         )
 
-    def _to_sequences(self, padded: Any) -> Sequences:
-        """What the policy sees of sb3-contrib's minibatch."""
-        n_sequences = padded.lstm_states.pi[0].shape[1]
-        starts = padded.episode_starts.reshape(n_sequences, -1)[:, 0]
-        goes_on = (1.0 - starts).view(1, n_sequences, 1)
-        return Sequences(
-            observations=padded.observations,
-            actor_states=_scale(padded.lstm_states.pi, goes_on),
-            critic_states=_scale(padded.lstm_states.vf, goes_on),
-            valid=padded.mask.reshape(-1, self.n_components)[:, 0] > 0,
+    def _observations_at(self, steps: NDArray[np.int_]) -> PyTorchObs:
+        if isinstance(self.observations, dict):
+            parts = self.observations.items()
+            return {name: self.to_torch(array[steps], copy=False) for name, array in parts}
+        return self.to_torch(self.observations[steps], copy=False)
+
+    def _states_at(
+        self, network: str, batch_inds: NDArray[np.int_], firsts: NDArray[np.int_]
+    ) -> States:
+        """States before the first step of each sequence, none where it begins an episode."""
+        steps = batch_inds[firsts]
+        goes_on = 1.0 - self.episode_starts[steps, :, None]
+        arrays = [getattr(self, f"{kind}_states_{network}") for kind in ("hidden", "cell")]
+        return tuple(
+            self._to_floats((array[steps] * goes_on).swapaxes(0, 1)).contiguous()
+            for array in arrays
         )
+
+    def _to_floats(self, array: NDArray[Any]) -> th.Tensor:
+        return self.to_torch(array.astype(np.float32, copy=False), copy=False)
 
 
 class VectorRecurrentRolloutBuffer(_SequenceBuffer, RecurrentRolloutBuffer):  # type: ignore[misc]
@@ -61,7 +77,3 @@ class VectorRecurrentRolloutBuffer(_SequenceBuffer, RecurrentRolloutBuffer):  # 
 
 class VectorRecurrentDictRolloutBuffer(_SequenceBuffer, RecurrentDictRolloutBuffer):  # type: ignore[misc]
     """:class:`VectorRecurrentRolloutBuffer` for dictionary observations."""
-
-
-def _scale(states: States, factor: th.Tensor) -> States:
-    return tuple(state * factor for state in states)

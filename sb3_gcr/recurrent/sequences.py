@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 #: Hidden and cell state of an LSTM, each of shape (layers, S, units).
@@ -67,6 +68,25 @@ class Sequences(NamedTuple):
             critic_states=tuple(state[:, indices] for state in self.critic_states),
             valid=cut(self.valid),
         )
+
+
+class Layout(NamedTuple):
+    """Where the B steps of a minibatch stand in S sequences of L steps."""
+
+    firsts: NDArray[np.int_]  # number of the first step of each sequence, (S,)
+    steps: NDArray[np.int_]  # number of each step, the last one repeated as padding, (S, L)
+    valid: NDArray[np.bool_]  # which are no padding, (S, L)
+
+
+def lay_out(begins: NDArray[np.bool_]) -> Layout:
+    """Cut a minibatch into sequences.
+
+    :param begins: which steps begin a sequence, shape (B,); the first one does in any case
+    """
+    firsts = np.flatnonzero(np.append(True, begins[1:]))
+    lasts = np.append(firsts[1:], len(begins)) - 1
+    steps = firsts[:, None] + np.arange((lasts - firsts).max() + 1)
+    return Layout(firsts, np.minimum(steps, lasts[:, None]), steps <= lasts[:, None])
 
 
 def take_sequences(
