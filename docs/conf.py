@@ -25,8 +25,9 @@ extensions = [
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build", "inventories"]
 
-# GitHub's Markdown: $formulas$, and links to headings such as tasks.md#throwingmo.
-myst_enable_extensions = ["dollarmath"]
+# GitHub's Markdown: $formulas$, and links to headings such as tasks.md#throwingmo. The glossary has
+# definitions.
+myst_enable_extensions = ["deflist", "dollarmath"]
 myst_heading_anchors = 3
 
 # Types stand beside the parameters, where the docstrings explain them; defaults as they are written
