@@ -42,8 +42,10 @@ autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 python_use_unqualified_type_names = True
 
-# Type variables have no page.
+# Type variables, and bases that nobody uses by themselves, have no page.
 nitpick_ignore = [
+    ("py:class", "sb3_gcr.buffers.ComponentBuffer"),
+    ("py:class", "sb3_gcr.update.ConflictResolution"),
     ("py:class", "sb3_gcr.gcrppo.SelfGCRPPO"),
     ("py:class", "sb3_gcr.advantages.ArrayT"),
 ]
