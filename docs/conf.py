@@ -25,8 +25,9 @@ extensions = [
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build", "inventories"]
 
-# GitHub's Markdown: $formulas$, and links to headings such as tasks.md#throwingmo.
-myst_enable_extensions = ["dollarmath"]
+# GitHub's Markdown: $formulas$, and links to headings such as tasks.md#throwingmo. The glossary has
+# definitions.
+myst_enable_extensions = ["deflist", "dollarmath"]
 myst_heading_anchors = 3
 
 # Types stand beside the parameters, where the docstrings explain them; defaults as they are written
@@ -41,8 +42,10 @@ autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 python_use_unqualified_type_names = True
 
-# Type variables have no page.
+# Type variables, and bases that nobody uses by themselves, have no page.
 nitpick_ignore = [
+    ("py:class", "sb3_gcr.buffers.ComponentBuffer"),
+    ("py:class", "sb3_gcr.update.ConflictResolution"),
     ("py:class", "sb3_gcr.gcrppo.SelfGCRPPO"),
     ("py:class", "sb3_gcr.advantages.ArrayT"),
 ]

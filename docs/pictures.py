@@ -1,29 +1,33 @@
-"""The pictures of method.md, logs.md and conflicts.md: ``python docs/pictures.py`` makes them again
-in a few minutes.
+"""The pictures that can be drawn from what is stored here: ``python docs/pictures.py``, seconds.
+
+The others need more. ``returns``, ``conflicts`` and ``cosines`` are those of ``make train``; frames
+and curves of the trained robots are made by ``examples/show.py`` (docs/tasks.md has the commands).
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecNormalize
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # type: ignore[import-untyped]
 
-from sb3_gcr import GCRPPO, RESOLVERS, RewardDecomposition
+from sb3_gcr import RESOLVERS
 
 IMAGES = Path(__file__).parent / "images"
+#: Of ``python -m benchmarks.conflicts measure``.
+NOISE = Path(__file__).parent / "data" / "conflicts.json"
+#: The log of a training on HalfCheetah, made by ``examples/cheetah.py``.
+CHEETAH = Path(__file__).parent / "data" / "halfcheetah.csv"
+#: The runs of ``examples/humanoid_table.py``, and its methods.
+HUMANOID = Path(__file__).parents[1] / "results" / "humanoid"
+METHODS = ("PPO", "sum", "levels", "gcr", "sum component")
 #: Two tasks that conflict, and a regulariser against both.
 GRADIENTS = np.array([[1.0, 0.0], [-0.6, 0.8], [-3.0, -3.0]])
 LEVELS = np.array([0, 0, 1])
@@ -64,8 +68,9 @@ def arrow(
 
 def counterexample() -> Figure:
     """Where the steps of three resolvers lead when two tasks conflict."""
-    figure = Figure(figsize=(10.5, 3.6), layout="constrained")
-    for axis, resolver in zip(figure.subplots(1, 3), ("sum", "gcr", "guaranteed"), strict=True):
+    figure = Figure(figsize=(6.6, 6.2), layout="constrained")  # two rows: legible on a phone
+    axes = figure.subplots(2, 2).flat
+    for axis, resolver in zip(axes, ("sum", "gcr", "levels", "guaranteed"), strict=True):
         # No task gets worse where both inner products are >= 0: between the directions (0, 1) and
         # (0.8, 0.6).
         axis.add_patch(Polygon([(0, 0), (0, 9), (12, 9)], color="#bfe3c6", zorder=0))
@@ -109,7 +114,7 @@ def clipping() -> Figure:
     total = advantages.sum()
     is_clipped = ratio * total > clipped * total
     jointly = np.where(is_clipped, clipped, ratio) * advantages[:, None]
-    figure = Figure(figsize=(8.2, 3.4), layout="constrained")
+    figure = Figure(figsize=(6.6, 3.2), layout="constrained")
     panels = {"component by component": by_component, "one clip per sample": jointly}
     for axis, (title, surrogates) in zip(
         figure.subplots(1, 2, sharey=True), panels.items(), strict=True
@@ -142,35 +147,25 @@ def clipping() -> Figure:
     return figure
 
 
-def training(timesteps: int, folder: str) -> EventAccumulator:
-    """Train on HalfCheetah with a TensorBoard log, and read that."""
-    env = VecNormalize(
-        make_vec_env("HalfCheetah-v5", n_envs=8, seed=0, wrapper_class=RewardDecomposition)
-    )
-    model = GCRPPO("MlpPolicy", env, n_steps=256, seed=0, device="cpu")
-    model.set_logger(configure(folder, ["tensorboard"]))
-    model.learn(timesteps)
-    model.logger.close()
-    return EventAccumulator(folder).Reload()
-
-
-def conflict(log: EventAccumulator) -> Figure:
-    """Four panels of the log, as TensorBoard shows them."""
+def conflict() -> Figure:
+    """Four panels of a training's log, as TensorBoard shows them."""
+    with CHEETAH.open(newline="") as file:
+        log = list(csv.DictReader(file))
     panels = {
         "rollout/ep_rew/<name>": ["rollout/ep_rew/reward_forward", "rollout/ep_rew/reward_ctrl"],
         "gcr/conflict_rate": ["gcr/conflict_rate"],
         "gcr/grad_norm/<name>": ["gcr/grad_norm/reward_forward", "gcr/grad_norm/reward_ctrl"],
         "gcr/weight/<name>": ["gcr/weight/reward_forward", "gcr/weight/reward_ctrl"],
     }
-    figure = Figure(figsize=(10.5, 5.6), layout="constrained")
+    figure = Figure(figsize=(6.6, 4.8), layout="constrained")
     for axis, (title, keys) in zip(figure.subplots(2, 2).flat, panels.items(), strict=True):
         for key in keys:
-            events = log.Scalars(key)
+            rows = [row for row in log if row[key]]
             name = key.rsplit("/", 1)[1]
             colour = {"reward_forward": BLUE, "reward_ctrl": ORANGE}.get(name, GREY)
             axis.plot(
-                [event.step for event in events],
-                [event.value for event in events],
+                [float(row["time/total_timesteps"]) for row in rows],
+                [float(row[key]) for row in rows],
                 color=colour,
                 label=name,
             )
@@ -184,12 +179,12 @@ def conflict(log: EventAccumulator) -> Figure:
     return figure
 
 
-def noise(data: dict[str, Any], pairs: Sequence[tuple[str, str]]) -> Figure:
+def noise(pairs: Sequence[tuple[str, str]] = NOISE_PAIRS) -> Figure:
     """Cosines within minibatches over their size, against those of independent rollouts.
 
-    :param data: of ``python -m benchmarks.conflicts measure``
     :param pairs: names of the terms, one panel each
     """
+    data = json.loads(NOISE.read_text())
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     sizes = [int(size) for size in data["minibatches"]]
     for axis, pair in zip(figure.subplots(1, len(pairs), sharey=True), pairs, strict=True):
@@ -215,32 +210,50 @@ def noise(data: dict[str, Any], pairs: Sequence[tuple[str, str]]) -> Figure:
     return figure
 
 
+def results() -> Figure:
+    """One dot per seed and method on Humanoid-v5, and the means."""
+    runs = [json.loads(path.read_text()) for path in sorted(HUMANOID.glob("*-*.json"))]
+    figure = Figure(figsize=(6.6, 3.0), layout="constrained")
+    training, final = figure.subplots(1, 2, sharey=True)
+    for place, method in enumerate(METHODS):
+        own = [run for run in runs if run["method"] == method]
+        colour = GREY if method == "PPO" else BLUE
+        dots(training, place, [run["during training"] for run in own], colour)
+        dots(final, place, [run["final"]["return"] for run in own], colour)
+    training.set_title("return in training", loc="left", fontsize=11)
+    final.set_title("final return", loc="left", fontsize=11)
+    training.set_yticks(range(len(METHODS)), METHODS, family="monospace")
+    training.invert_yaxis()
+    return figure
+
+
+def dots(axis: Axes, place: int, values: list[float], colour: str) -> None:
+    """One row of dots, with a stroke at their mean."""
+    axis.plot(values, [place] * len(values), "o", color=colour, alpha=0.6)
+    axis.plot(np.mean(values), place, "|", color=RED, ms=18, mew=2.5)
+    axis.grid(axis="x", alpha=0.3)
+
+
+#: What draws each picture, by the name of its file.
+PICTURES = {
+    "clipping": clipping,
+    "counterexample": counterexample,
+    "conflict": conflict,
+    "noise": noise,
+    "humanoid_results": results,
+}
+
+
 def main() -> None:
     """Make all pictures, or those that are named."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "names",
-        nargs="*",
-        metavar="NAME",
-        help="counterexample, clipping, conflict, noise (default: all)",
-    )
-    parser.add_argument(
-        "--timesteps", type=int, default=100_000, help="of the training for `conflict`"
-    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(PICTURES)} (all)")
     arguments = parser.parse_args()
-    names = arguments.names or ["counterexample", "clipping", "conflict", "noise"]
-    if "noise" in names:
-        data = json.loads((IMAGES.parent / "data" / "conflicts.json").read_text())
-        noise(data, NOISE_PAIRS).savefig(IMAGES / "noise.png", dpi=130)
-    if "clipping" in names:
-        clipping().savefig(IMAGES / "clipping.png", dpi=130)
-    if "counterexample" in names:
-        counterexample().savefig(IMAGES / "counterexample.png", dpi=130)
-    if "conflict" in names:
-        with tempfile.TemporaryDirectory() as folder:
-            conflict(training(arguments.timesteps, folder)).savefig(
-                IMAGES / "conflict.png", dpi=130
-            )
+    unknown = sorted(set(arguments.names) - set(PICTURES))
+    if unknown:
+        parser.error(f"Names must be among {list(PICTURES)}, found {unknown}.")
+    for name in arguments.names or PICTURES:
+        PICTURES[name]().savefig(IMAGES / f"{name}.png", dpi=130)
 
 
 if __name__ == "__main__":

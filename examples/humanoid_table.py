@@ -34,6 +34,9 @@ METHODS: dict[str, dict[str, Any]] = {
 ENV = "Humanoid-v5"
 TIMESTEPS = 200_000
 N_EVAL_EPISODES = 20
+#: Marks of a page between which the tables stand.
+START = "<!-- tables of examples/humanoid_table.py -->"
+END = "<!-- end of the tables -->"
 RESULTS = Path(__file__).parents[1] / "results" / "humanoid"
 
 
@@ -79,7 +82,12 @@ def run(method: str, seed: int) -> dict[str, Any]:
     }
 
 
-def table(results: list[dict[str, Any]]) -> str:
+def stored(folder: Path) -> list[dict[str, Any]]:
+    """The runs in a folder, in the order of their names."""
+    return [json.loads(path.read_text()) for path in sorted(folder.glob("*-*.json"))]
+
+
+def rows_of(results: list[dict[str, Any]]) -> list[list[str]]:
     """One row per method: learning speed and final return, with p values against PPO, and terms."""
     runs = {name: [row for row in results if row["method"] == name] for name in METHODS}
     training = {name: [row["during training"] for row in rows] for name, rows in runs.items()}
@@ -87,14 +95,36 @@ def table(results: list[dict[str, Any]]) -> str:
     p_training, p_final = p_values(training), p_values(final)
     terms = [key for key in results[0]["final"] if key != "return"]
     head = ["method", "", "seeds", "return in training", "minus PPO, %", "p", "final return", "p"]
-    rows = [[*head, *terms]]
+    table_rows = [[*head, *terms]]
     for name, cells in runs.items():
         gap = "" if name == "PPO" else percent(training["PPO"], training[name])
         row = [name, "", str(len(cells)), interval(training[name]), gap]
         row += [p_training.get(name, ""), interval(final[name]), p_final.get(name, "")]
         row += [interval([cell["final"][term] for cell in cells]) for term in terms]
-        rows.append(row)
-    return format_table(rows)
+        table_rows.append(row)
+    return table_rows
+
+
+def markdown(rows: list[list[str]]) -> str:
+    """The rows as two tables for a page, whole returns and terms, neither too wide for it."""
+    tables = []
+    for columns in (slice(2, 8), slice(8, None)):
+        head, *others = ([row[0], *row[columns]] for row in rows)
+        lines = [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *others)]
+        tables.append("\n".join(lines).replace(" -", " −").replace(" −--", " ---"))
+    return "\n\n".join(tables)
+
+
+def write(page: Path, tables: str) -> None:
+    """Put the tables between the marks of a page.
+
+    :raises ValueError: if the page has no marks
+    """
+    before, start, rest = page.read_text(encoding="utf-8").partition(START)
+    _, end, after = rest.partition(END)
+    if not end:
+        raise ValueError(f"{page} must have {START!r} and {END!r}, between which the tables go.")
+    page.write_text(f"{before}{start}\n\n{tables}\n\n{end}{after}", encoding="utf-8")
 
 
 def p_values(samples: dict[str, list[float]]) -> dict[str, str]:
@@ -122,19 +152,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--folder", type=Path, default=RESULTS, help="of the runs' results")
+    parser.add_argument(
+        "--write", type=Path, nargs="*", default=[], metavar="PAGE", help="put the tables there"
+    )
+    parser.add_argument("--no-runs", action="store_true", help="of what is in the folder already")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     th.set_num_threads(1)
     jobs = [(method, seed) for seed in range(arguments.seeds) for method in METHODS]
-    results = []
+    if arguments.no_runs:
+        jobs = []
     for method, seed in tqdm(jobs, unit="run"):
         path = arguments.folder / f"{method.replace(' ', '_')}-{seed}.json"
         if not path.exists():
             partial = path.with_suffix(".partial")
             partial.write_text(json.dumps(run(method, seed), indent=1) + "\n")
             os.replace(partial, path)
-        results.append(json.loads(path.read_text()))
-    print(table(results))
+    rows = rows_of(stored(arguments.folder))
+    print(format_table(rows))
+    for page in arguments.write:
+        write(page, markdown(rows))
 
 
 if __name__ == "__main__":

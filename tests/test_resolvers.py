@@ -296,11 +296,9 @@ def test_share_of_draws_in_which_a_task_gets_worse() -> None:
         for name in worse:
             gains = jacobian[:4] @ step(RESOLVERS[name], jacobian, levels, rng)
             worse[name] += bool((gains < -1e-6 * np.linalg.norm(jacobian, axis=1).max() ** 2).any())
-    share = {name: count / draws for name, count in worse.items()}
-    assert share["guaranteed"] == 0
-    assert share["sum"] == pytest.approx(0.65, abs=0.04)
-    assert share["gcr_authors"] == pytest.approx(0.31, abs=0.04)
-    assert share["gcr"] == pytest.approx(0.10, abs=0.04)
+    percent = {name: round(100 * count / draws) for name, count in worse.items()}
+    # The figures of README, method.md and resolvers.md.
+    assert percent == {"sum": 65, "gcr": 12, "gcr_authors": 31, "guaranteed": 0}
 
 
 @given(
