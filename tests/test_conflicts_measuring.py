@@ -153,6 +153,17 @@ def test_a_loaded_model_needs_no_env_of_its_own(tmp_path: Any) -> None:
     np.testing.assert_allclose(from_file.estimate.gramian, from_memory.estimate.gramian, rtol=1e-5)
 
 
+def test_an_evaluation_env_is_seen_as_in_training() -> None:
+    """Value heads have the units of normalised rewards, and an evaluation env does without."""
+    model = GCRPPO("MlpPolicy", make_env(normalise=True), **KWARGS)
+    model.learn(64)
+    other = VecNormalize(make_env(), training=False, norm_reward=False)
+    evaluation = measure_conflicts(model, other, n_rollouts=3, seed=5)
+    training = measure_conflicts(model, make_env(normalise=True), n_rollouts=3, seed=5)
+    np.testing.assert_allclose(evaluation.estimate.gramian, training.estimate.gramian, rtol=1e-5)
+    assert not other.norm_reward
+
+
 def test_gradients_of_a_rollout_are_those_of_its_samples() -> None:
     """Chunk by chunk, against one backward pass for each term over all samples."""
     model = GCRPPO("MlpPolicy", make_env(), **KWARGS)
