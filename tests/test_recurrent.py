@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import pickle
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -362,6 +364,16 @@ def test_gcrppo_names_the_class_for_an_lstm_and_for_masks() -> None:
 def test_bad_arguments(given: Any, message: str) -> None:
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         make(**given)
+
+
+def test_without_sb3_contrib_the_error_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    monkeypatch.delitem(sys.modules, "sb3_gcr.recurrent")
+    message = "sb3_gcr.recurrent needs sb3-contrib: pip install 'sb3_gcr[recurrent]' ("
+    with pytest.raises(ImportError, match=f"^{re.escape(message)}"):
+        importlib.import_module("sb3_gcr.recurrent")
 
 
 class Recall(gym.Env[Any, Any]):
