@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
+
+from docutils import nodes
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -80,6 +83,15 @@ def _escape_bars(app: Any, what: str, name: str, obj: Any, options: Any, lines: 
     lines[:] = [line.replace("|", "\\|") for line in lines]
 
 
+def _shorten_diffs(app: Any, doctree: nodes.document) -> None:
+    """The head of a diff has names of files, and not where they lie on this machine."""
+    for block in doctree.findall(nodes.literal_block):
+        if block.rawsource.startswith("--- /"):
+            text = re.sub(r"(?m)^(---|\+\+\+) /\S*/(\S+)", r"\1 \2", block.rawsource)
+            block.rawsource, block[:] = text, [nodes.Text(text)]
+
+
 def setup(app: Any) -> None:
     """Sphinx calls this."""
+    app.connect("doctree-read", _shorten_diffs)
     app.connect("autodoc-process-docstring", _escape_bars)
