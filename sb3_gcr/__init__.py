@@ -1,9 +1,10 @@
 """GCR-PPO for Stable-Baselines3: PPO that keeps the terms of a reward apart.
 
-Read the method top to bottom: ``components`` (names and levels of the reward's terms),
-``advantages`` (one advantage per term), ``gradients`` (one gradient per term and their Gramian),
-``resolvers`` (who yields to whom), ``gcrppo`` (the loop). ``envs`` has tasks with such rewards, and
-a thread pool that steps hundreds of them.
+Read the method top to bottom: ``rewards.spec`` (names and levels of the reward's terms),
+``multi_head`` (rollouts with a value per term), ``buffers`` and ``advantages`` (one advantage per
+term), ``losses`` (one surrogate per term), ``update`` (the loop), ``resolvers`` (who yields to
+whom), ``gradients`` (one gradient per term and their Gramian). ``envs`` has tasks with such
+rewards, and a thread pool that steps hundreds of them.
 """
 
 import sb3_gcr.envs as envs
