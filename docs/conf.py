@@ -70,6 +70,8 @@ intersphinx_mapping = {
 # Furo and not SB3's sphinx_rtd_theme: wide tables scroll by themselves in a narrow window, and it
 # has a dark mode.
 html_theme = "furo"
+# Module names in code must not look like links.
+pygments_dark_style = "github-dark"
 html_title = f"sb3_gcr {version}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
