@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from sb3_gcr import RESOLVERS
+from sb3_gcr import RESOLVERS, RewardSpec
+from sb3_gcr.logs.shown import cosine_figure
 
 IMAGES = Path(__file__).parent / "images"
 #: Of ``python -m benchmarks.conflicts measure``.
@@ -235,7 +236,18 @@ def dots(axis: Axes, place: int, values: list[float], colour: str) -> None:
 
 
 #: What draws each picture, by the name of its file.
+def humanoid_conflicts() -> Figure:
+    """Cosines of HumanoidRun's seven terms as minibatches of 64 show them, and as they are."""
+    data = json.loads(NOISE.read_text())
+    spec = RewardSpec(tuple(data["names"]), (0, 0, 0, 0, 1, 1, 1))
+    within = np.array(data["minibatches"]["64"]["naive"], dtype=float)
+    between = np.array(data["cosines"], dtype=float)
+    matrices = {"within minibatches of 64": within, "between independent rollouts": between}
+    return cosine_figure(spec, matrices)
+
+
 PICTURES = {
+    "humanoid_conflicts": humanoid_conflicts,
     "clipping": clipping,
     "counterexample": counterexample,
     "conflict": conflict,

@@ -150,26 +150,24 @@ def _conflicts_figure(progress: pd.DataFrame, spec: RewardSpec) -> Figure:
 
 def _cosines_figure(folder: str | Path, spec: RewardSpec) -> Figure:
     """Cosines over the first and the last tenth of the updates: from products without shared noise
-    where the log has enough of them, else within minibatches.
+    where these say anything, else within minibatches.
     """
     within = _read(folder, COSINES_FILE)
     _check_cosines(within, COSINES_FILE, pair_names(spec), folder)
     unbiased = _read_unbiased(folder, spec)
-    if unbiased is None:
-        return cosine_figure(
-            spec,
-            {
-                f"{when}\nwithin minibatches": _mean_matrix(rows, spec)
-                for when, rows in _tenths(within, 1)
-            },
-        )
-    return cosine_figure(
-        spec,
-        {
+    if unbiased is not None:
+        estimates = {
             f"{when}\nwithout shared noise": _estimate(rows, spec).cosines
             for when, rows in _tenths(unbiased, FEWEST_UPDATES)
-        },
-    )
+        }
+        pairs = np.triu_indices(len(spec), 1)
+        if any(np.isfinite(matrix[pairs]).any() for matrix in estimates.values()):
+            return cosine_figure(spec, estimates)
+    means = {
+        f"{when}\nwithin minibatches, noise included": _mean_matrix(rows, spec)
+        for when, rows in _tenths(within, 1)
+    }
+    return cosine_figure(spec, means)
 
 
 def _check_cosines(rows: pd.DataFrame, name: str, expected: list[str], folder: str | Path) -> None:
@@ -198,8 +196,8 @@ def _tenths(rows: pd.DataFrame, fewest: int) -> list[tuple[str, pd.DataFrame]]:
     tenth = max(fewest, len(rows) // 10)
     first, last = rows.iloc[:tenth], rows.iloc[-tenth:]
     return [
-        (f"start of training\nup to {first[STEPS].iloc[-1]:,} steps", first),
-        (f"end of training\nfrom {last[STEPS].iloc[0]:,} steps", last),
+        (f"start, up to {first[STEPS].iloc[-1]:,} steps", first),
+        (f"end, from {last[STEPS].iloc[0]:,} steps", last),
     ]
 
 
