@@ -301,6 +301,9 @@ ARROWS = {
     "study.__main__": {"study.__init__"},
     "study.cells": {
         "gcrppo",
+        "multi_head",
+        "recurrent.__init__",
+        "update",
         "resolvers",
         "rewards.reading",
         "rewards.spec",

@@ -15,7 +15,8 @@ pytest.importorskip("rl_zoo3")
 import yaml
 
 from sb3_gcr.recurrent import RecurrentGCRPPO
-from sb3_gcr.zoo import commands as zoo
+from sb3_gcr.zoo import commands, managers
+from sb3_gcr.zoo.hyperparameters import hyperparameter_file
 
 pytestmark = pytest.mark.filterwarnings("ignore:Argument ``multivariate`` is an experimental")
 ENTRIES = yaml.safe_load((files("sb3_gcr.hyperparams") / "gcrppo_lstm.yml").read_text())
@@ -32,8 +33,8 @@ def _gymnasium_as_it_was() -> Iterator[None]:
 
 @pytest.mark.parametrize("env_id", list(ENTRIES))
 def test_every_entry_makes_a_model_and_leaves_no_rest(env_id: str) -> None:
-    zoo.register()
-    manager = zoo._managers()[0](
+    commands.register()
+    manager = managers.ZooManager(
         argparse.Namespace(), "gcrppo_lstm", env_id, "logs", eval_freq=-1, verbose=0, device="cpu"
     )
     model: Any = manager.setup_experiment()[0]  # type: ignore[index]
@@ -44,17 +45,17 @@ def test_every_entry_makes_a_model_and_leaves_no_rest(env_id: str) -> None:
 
 
 def test_an_env_without_an_entry_has_rl_zoo3s_settings_of_recurrent_ppo() -> None:
-    zoo.register()
-    manager = zoo._managers()[0](argparse.Namespace(), "gcrppo_lstm", "Acrobot-v1", "logs")
+    commands.register()
+    manager = managers.ZooManager(argparse.Namespace(), "gcrppo_lstm", "Acrobot-v1", "logs")
     assert Path(manager.config).name == "ppo_lstm.yml"
-    assert zoo.hyperparameter_file("gcrppo_lstm", "Hopper-v5")
+    assert hyperparameter_file("gcrppo_lstm", "Hopper-v5")
 
 
 def test_train_writes_a_model_that_loads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     options = ["--verbose", "0", "--seed", "0", "--device", "cpu", "-n", "64", "--eval-freq", "-1"]
     small = ["-params", "n_steps:32", "batch_size:32", "n_epochs:1", "policy_kwargs:None"]
-    zoo.main(["train", "--algo", "gcrppo_lstm", "--env", "Hopper-v5", *options, *small])
+    commands.main(["train", "--algo", "gcrppo_lstm", "--env", "Hopper-v5", *options, *small])
     path = tmp_path / "logs/gcrppo_lstm/Hopper-v5_1/Hopper-v5.zip"
     model = RecurrentGCRPPO.load(path, device="cpu")
     assert model.reward_spec.names == ("reward_forward", "reward_survive", "reward_ctrl")

@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_gcr.gcrppo import GCRPPO
+from sb3_gcr.multi_head import find_kind
 from sb3_gcr.resolvers import RESOLVERS
 from sb3_gcr.rewards.reading import find_reward_spec
 from sb3_gcr.rewards.spec import RewardSpec
@@ -35,6 +36,7 @@ from sb3_gcr.study.watching import (
     finished,
     over_windows,
 )
+from sb3_gcr.update import ConflictResolution
 
 #: Deterministic episodes of the trained policy, and episodes of random actions.
 EVALUATION_EPISODES, RANDOM_EPISODES = 64, 16
@@ -159,7 +161,19 @@ def normalised(envs: VecEnv, cell: Fields) -> VecEnv:
     )
 
 
-def make_model(cell: Fields, envs: VecEnv, resolver: WatchedResolver) -> GCRPPO:
+def algorithm_for(policy: str) -> Any:
+    """GCRPPO, or RecurrentGCRPPO for a policy with an LSTM.
+
+    :param policy: name of the policy
+    """
+    if find_kind(policy) != "recurrent":
+        return GCRPPO
+    from sb3_gcr.recurrent import RecurrentGCRPPO  # an extra
+
+    return RecurrentGCRPPO
+
+
+def make_model(cell: Fields, envs: VecEnv, resolver: WatchedResolver) -> ConflictResolution:
     """The model of a cell.
 
     :param cell: canonical
@@ -167,7 +181,7 @@ def make_model(cell: Fields, envs: VecEnv, resolver: WatchedResolver) -> GCRPPO:
     :param resolver: of the cell's method
     """
     settings = cell["settings"] | cell["algorithm"]["overrides"]
-    return GCRPPO(
+    return algorithm_for(settings["policy"])(
         settings["policy"],
         envs,
         **{name: settings[name] for name in (*MODEL, *OURS)},
@@ -189,7 +203,7 @@ def whole_rollouts(cell: Fields) -> int:
 
 
 def _evaluate(
-    cell: Fields, model: GCRPPO, training: VecEnv, spec: RewardSpec, threads: int
+    cell: Fields, model: ConflictResolution, training: VecEnv, spec: RewardSpec, threads: int
 ) -> list[Episode]:
     """Deterministic episodes of the trained policy."""
     seed = SEED_STRIDE * cell["seed"] + EVALUATION_OFFSET
