@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
@@ -22,6 +23,51 @@ from sb3_gcr.losses import Clip, surrogate_cotangents
 
 SIZES = (64, 128, 256, 512, 1024)
 BATCH = 2048
+
+
+def agreement(
+    part: NDArray[np.float64], gramian: NDArray[np.float64], levels: NDArray[np.int_]
+) -> tuple[float, float, float]:
+    """Cosine of the steps, mean error of the weights, and share of pairs that conflict in both or
+    in neither.
+
+    :param part: G from a part of the minibatch, shape (K, K)
+    :param gramian: the exact one
+    :param levels: shape (K,)
+    """
+    weights, exact = (
+        RESOLVERS["gcr"](each, levels, np.random.default_rng(0)) for each in (part, gramian)
+    )
+    # Both steps with all samples, as GCRPPO takes them: ⟨Jᵀw, Jᵀv⟩ = wᵀ G v.
+    norms = (weights @ gramian @ weights) * (exact @ gramian @ exact)
+    cosine = weights @ gramian @ exact / np.sqrt(norms)
+    error = np.abs(weights - exact).mean() / np.abs(exact).mean()
+    pairs = np.triu_indices(len(levels), 1)
+    agree = (conflicts(part)[pairs] == conflicts(gramian)[pairs]).mean()
+    return float(cosine), float(error), float(agree)
+
+
+def table(figures: dict[int, list[tuple[float, float, float]]], batch_size: int) -> str:
+    """One row per size of the part.
+
+    :param figures: of :func:`agreement` by size
+    :param batch_size: of the minibatch
+    """
+    columns = ("cosine of the steps: median", "lowest", "mean weight error", "pairs agreed on")
+    rows = [["samples", "of", *columns]]
+    for size, found in figures.items():
+        cosines, errors, agreed = np.array(found).T
+        rows.append(
+            [
+                str(size),
+                str(batch_size),
+                f"{np.median(cosines):.4f}",
+                f"{cosines.min():.4f}",
+                f"{np.mean(errors):.1%}",
+                f"{np.mean(agreed):.0%}",
+            ]
+        )
+    return format_table(rows)
 
 
 class Agreement(BaseCallback):
@@ -56,21 +102,9 @@ class Agreement(BaseCallback):
             log_prob, log_probs.flatten(), advantages, Clip(0.2, None)
         )
         gramian = networks.gramian(cotangents).double().numpy()
-        exact = RESOLVERS["gcr"](gramian, levels, np.random.default_rng(0))
         for size in SIZES:
             part = networks.gramian(cotangents, size).double().numpy()
-            weights = RESOLVERS["gcr"](part, levels, np.random.default_rng(0))
-            # Both steps with all samples, as GCRPPO takes them: ⟨Jᵀw, Jᵀv⟩ = wᵀ G v.
-            cosine = (
-                weights
-                @ gramian
-                @ exact
-                / np.sqrt((weights @ gramian @ weights) * (exact @ gramian @ exact))
-            )
-            error = np.abs(weights - exact).mean() / np.abs(exact).mean()
-            pairs = np.triu_indices(len(levels), 1)
-            agree = (conflicts(part)[pairs] == conflicts(gramian)[pairs]).mean()
-            self.figures[size].append((float(cosine), float(error), float(agree)))
+            self.figures[size].append(agreement(part, gramian, levels))
 
 
 def main() -> None:
@@ -91,33 +125,11 @@ def main() -> None:
     model = GCRPPO("MlpPolicy", env, n_steps=512, batch_size=BATCH, n_epochs=10, **kwargs)
     callback = Agreement()
     model.learn(arguments.timesteps, callback=callback, progress_bar=True)
-    rows = [
-        [
-            "samples",
-            "of",
-            "cosine of the steps: median",
-            "lowest",
-            "mean weight error",
-            "pairs agreed on",
-        ]
-    ]
-    for size, figures in callback.figures.items():
-        cosines, errors, agreed = np.array(figures).T
-        rows.append(
-            [
-                str(size),
-                str(BATCH),
-                f"{np.median(cosines):.4f}",
-                f"{cosines.min():.4f}",
-                f"{np.mean(errors):.1%}",
-                f"{np.mean(agreed):.0%}",
-            ]
-        )
     print(
         f"{arguments.env}, {model.num_timesteps:,} steps, net 400×200×100, "
         f"{len(model.reward_spec)} components"
     )
-    print(format_table(rows))
+    print(table(callback.figures, BATCH))
 
 
 if __name__ == "__main__":
