@@ -61,7 +61,7 @@ class Curve(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         model: Any = self.model
-        means = np.mean(model.ep_component_buffer, axis=0).tolist()
+        means = np.mean(model.ep_component_buffer, axis=0).round(1).tolist()
         point = dict(zip(model.reward_spec.names, means, strict=True))
         self.points.append({"timesteps": self.num_timesteps, **point})
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -88,3 +90,16 @@ def test_other_observations_are_refused() -> None:
     )
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         HideObservations(env, [0])
+
+
+def test_the_table_of_the_docs_is_what_was_stored() -> None:
+    docs = Path(__file__).parents[1] / "docs"
+    text = (docs / "recurrent.md").read_text().replace("−", "-")
+    runs = json.loads((docs / "data/memory.json").read_text())["runs"]
+    assert [len(run["points"]) for run in runs] == [37] * 4
+    for run in runs:
+        point = run["points"][-1]
+        names = ("reward_survive", "distance_penalty", "velocity_penalty")
+        terms = [point[name] for name in names]
+        figures = " | ".join([f"{sum(terms):.0f}", *map(str, terms)])
+        assert f"| `{run['algorithm']}` | {run['seed']} | {figures} |" in text
