@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+import importlib.util
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
@@ -10,12 +12,14 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
-
-pytest.importorskip("rl_zoo3")
 import yaml
 
+# Importing rl_zoo3 here would change Gymnasium for the tests of other files.
+if importlib.util.find_spec("rl_zoo3") is None:
+    pytest.skip("needs rl_zoo3", allow_module_level=True)
+
 from sb3_gcr.recurrent import RecurrentGCRPPO
-from sb3_gcr.zoo import commands, managers
+from sb3_gcr.zoo import commands
 from sb3_gcr.zoo.hyperparameters import hyperparameter_file
 
 pytestmark = pytest.mark.filterwarnings("ignore:Argument ``multivariate`` is an experimental")
@@ -34,7 +38,7 @@ def _gymnasium_as_it_was() -> Iterator[None]:
 @pytest.mark.parametrize("env_id", list(ENTRIES))
 def test_every_entry_makes_a_model_and_leaves_no_rest(env_id: str) -> None:
     commands.register()
-    manager = managers.ZooManager(
+    manager = importlib.import_module("sb3_gcr.zoo.managers").ZooManager(
         argparse.Namespace(), "gcrppo_lstm", env_id, "logs", eval_freq=-1, verbose=0, device="cpu"
     )
     model: Any = manager.setup_experiment()[0]  # type: ignore[index]
@@ -46,7 +50,9 @@ def test_every_entry_makes_a_model_and_leaves_no_rest(env_id: str) -> None:
 
 def test_an_env_without_an_entry_has_rl_zoo3s_settings_of_recurrent_ppo() -> None:
     commands.register()
-    manager = managers.ZooManager(argparse.Namespace(), "gcrppo_lstm", "Acrobot-v1", "logs")
+    manager = importlib.import_module("sb3_gcr.zoo.managers").ZooManager(
+        argparse.Namespace(), "gcrppo_lstm", "Acrobot-v1", "logs"
+    )
     assert Path(manager.config).name == "ppo_lstm.yml"
     assert hyperparameter_file("gcrppo_lstm", "Hopper-v5")
 
